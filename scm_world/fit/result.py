@@ -27,7 +27,7 @@ from scm_world.fit.problem import (
 )
 from scm_world.fit.recordings import Limits, MeasuredNumber, Measurements, RecordedRun
 from scm_world.fit.shooting import Shooting
-from scm_world.fit.targets import FAR, Target, delay_of, ranges_of, values_of
+from scm_world.fit.targets import FAR, Target, delays_of, ranges_of, values_of
 from scm_world.geometry.rotations import aligned
 from scm_world.queries.world import World
 from scm_world.runs.canvas import PALETTE, blank, styled
@@ -117,16 +117,16 @@ class Fit:
         (``motor.control_delay``), so that the world replays the recording.
 
         Raises:
-            UnknownOption: A delay was fitted beside commands that have one already.
             ModelError: A delay was fitted to a step function.
         """
-        world, late = self.asked, delay_of(self.targets, self.scaled)
-        if late:
+        world, late = self.asked, delays_of(self.asked, self.targets, self.scaled)
+        if late.any():
             build, (kind, task, options, _), *_ = world.__reduce__()
             if not isinstance(task, ModelTask):
-                problem = f"its commands cannot be delayed by {late:.3g} control steps"
+                problem = f"its commands cannot be delayed by {late.max():.3g} control steps"
                 raise ModelError([f"{problem}: delay them in the step function, or before it"])
-            world = build(kind, task.delayed(late), options, None)
+            each = {n: late[at].max() for n, at in world.compiled.actions.items()}
+            world = build(kind, task.delayed(each), options, None)
             world._given = self.asked._given
         return world.given(values_of(self.targets, self.scaled))
 

@@ -20,6 +20,7 @@ from scm_world.variables import Box
 from scm_world.world import Simulation
 
 DELAY = "delay"  # name of the delay of all commands [s], which is fitted like a parameter
+LATE = "_delay"  # after the name of an action: the delay of one command [control steps]
 TIMESTEP = "timestep"  # a setting of the engine, which no robot has
 LONGEST_DELAY = 20.0  # [control steps]
 UNSEEN = 0.1  # scale of a parameter that is zero, if nothing shows a better one
@@ -29,7 +30,7 @@ FAR = 12.0  # largest logarithm of a positive parameter, relative to its default
 @final
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A fitted number: a component of a parameter, or the delay of the commands.
+    """A fitted number: a component of a parameter, or a delay of commands.
 
     Attributes:
         name: ``"upper_arm.mass"``, or ``"pole.inertia[1]"`` for a component of a vector.
@@ -42,7 +43,7 @@ class Target:
         low: Lower end of its range, scaled.
         high: Upper end, scaled.
         whole: Whether all components keep their proportions to this one: those of an inertia.
-        values: All numbers of the variable in the world; None for the delay, which the world lacks.
+        values: All numbers of the variable in the world; None for a delay, which the world lacks.
     """
 
     name: str
@@ -90,9 +91,13 @@ def values_of(targets: Sequence[Target], scaled: Floats) -> dict[str, Floats]:
     return found
 
 
-def delay_of(targets: Sequence[Target], scaled: Floats) -> float:
-    """Return the delay of the commands, in control steps."""
-    return float(sum(u for t, u in zip(targets, scaled, strict=True) if t.values is None))
+def delays_of(world: Simulation, targets: Sequence[Target], scaled: Floats) -> Floats:
+    """Return the fitted delays of commands in control steps, shape (n_actions,)."""
+    delays = np.zeros(world.compiled.n_actions)
+    for target, steps in zip(targets, scaled, strict=True):
+        if target.values is None:
+            delays[world.compiled.actions.get(target.name.removesuffix(LATE), slice(None))] += steps
+    return delays
 
 
 def ranges_of(targets: Sequence[Target]) -> tuple[Floats, Floats]:
@@ -120,7 +125,11 @@ def targets_of(world: Simulation, patterns: Iterable[str]) -> tuple[Target, ...]
     parts = {label: n for n in known for label in labels(n, model.declared(n).shape)}
     names = dict[str, None]()
     refused = world.composition.system.refused
-    delayed = world.compiled.n_actions > 0 and DELAY not in known
+    late = {f"{name}{LATE}": None for name in world.compiled.actions}
+    if world.compiled.n_actions:
+        late[DELAY] = None
+    late = {name for name in late if name not in model}
+    held = [name for name in world.compiled.actions if f"{name}_past" in model]
     for pattern in given:
         if not isinstance(pattern, str):
             raise UnknownVariable(pattern, known)
@@ -128,8 +137,11 @@ def targets_of(world: Simulation, patterns: Iterable[str]) -> tuple[Target, ...]
             raise NotIntervenable(pattern, str(refused[pattern]))
         if pattern in model and pattern not in known:
             raise NotIntervenable(pattern, "is not a parameter of real numbers that can be set")
-        if pattern == DELAY and delayed:
-            names[DELAY] = None
+        if pattern == DELAY and DELAY in late and held:
+            own = ", ".join(f"{name}{LATE}" for name in held)
+            raise NotIntervenable(DELAY, f"adds to delays that commands have already; fit {own}")
+        if pattern in late:
+            names[pattern] = None
             continue
         found = fitting(pattern, known if pattern in known else {**known, **parts})
         for name in found:
@@ -138,9 +150,9 @@ def targets_of(world: Simulation, patterns: Iterable[str]) -> tuple[Target, ...]
             names |= dict.fromkeys(parts_of_it)
     targets = []
     for name in names:
-        if name == DELAY and name not in parts:
-            dt = world.options.control_period
-            targets.append(Target(name, name, 0, "s", 0.0, dt, False, 0.0, LONGEST_DELAY))
+        if name in late:
+            unit, one = ("s", world.options.control_period) if name == DELAY else ("1", 1.0)
+            targets.append(Target(name, name, 0, unit, 0.0, one, False, 0.0, LONGEST_DELAY))
             continue
         whole = name in known and _kind(world, name) == "inertia"
         variable = model.declared(known.get(name) or parts[name])

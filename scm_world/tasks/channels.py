@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from math import ceil, inf, prod
 from typing import Any, cast, final
 
@@ -36,6 +37,10 @@ STEPS = "a whole number of control steps, 0 or more", "Integers(least, most): dr
 SHARES = (*STEPS, "of a command any number of control steps, such as 1.5")
 
 
+SAME = 1e-9
+"""Physics steps between two times that are the same."""
+
+
 @final
 @dataclass(frozen=True)
 class Channel:
@@ -44,21 +49,22 @@ class Channel:
     With d control steps of delay at most, a spread s and a standard normal number e of each control
     step, an actuator applies ``u[t - delay] + s e``, and a sensor reads ``y[t - delay] + s e``. In
     the first control steps an actuator applies its idle control, and a sensor reads the first
-    value. Of a delay of 1.3 control steps of an actuator, ``0.7 u[t - 1] + 0.3 u[t - 2]`` arrives.
+    value. Of a delay of 1.3 control steps of an actuator, ``u[t - 2]`` acts in the first 0.3 of a
+    control step, then ``u[t - 1]``; see ``switched``.
 
     Attributes:
         of: The command, or the measured variable.
         acts: Whether it is an actuator.
         noise: Default of s, in the unit of the quantity; None without noise.
         delay: The steps it has, or the space that they are drawn from at every reset; None if 0. A
-            number with a fraction is a delay of real numbers.
+            number with a fraction, or a box, is a delay of real numbers.
         causes: The states and parameters that a readout is computed from.
     """
 
     of: ModelRow
     acts: bool
     noise: float | None
-    delay: float | Integers | None
+    delay: float | Integers | Box | None
     causes: tuple[str, ...] = ()
 
     @property
@@ -67,24 +73,25 @@ class Channel:
         return prod(self.of.shape)
 
     @property
-    def most(self) -> int:
-        """The longest delay, in control steps."""
-        return self.delay.high if isinstance(self.delay, Integers) else ceil(self.delay or 0)
+    def ends(self) -> tuple[float, float]:
+        """The shortest and the longest delay that it can have, in control steps.
+
+        They are those of a space. Without one, the shortest is 0, or 1 of a command with a delay of
+        1 or more, which reaches nothing at once; the longest one is a whole number.
+        """
+        if isinstance(self.delay, Integers | Box):
+            return float(self.delay.low), float(self.delay.high)
+        return float(self.acts and (self.delay or 0) >= 1), float(ceil(self.delay or 0))
 
     @property
-    def least(self) -> int:
-        """The shortest delay: that of a space, or 1 of a command, which reaches nothing at once.
-
-        It is 0 of a command with a delay below 1.
-        """
-        if isinstance(self.delay, Integers):
-            return self.delay.low
-        return int(self.acts and (self.delay or 0) >= 1)
+    def most(self) -> int:
+        """How many past values are needed."""
+        return ceil(self.ends[1])
 
     @property
     def varies(self) -> bool:
         """Whether the delay is a variable."""
-        return self.least < self.most
+        return self.ends[0] < self.ends[1] or self.ends[1] < self.most
 
     def name(self, what: str) -> str:
         """Return the name of one of its variables."""
@@ -118,17 +125,17 @@ class Channel:
             name, start = self.name("noise"), self.noise
             yield ModelRow(name, self.of.unit, (), start, 0.0, inf, doc, *effect)
         if self.varies:
-            name, ends = self.name("delay"), (float(self.least), float(self.most))
-            yield ModelRow(name, "1", (), ends[1], *ends, "Delay in control steps.", *effect)
+            row = self.name("delay"), "1", (), self.ends[1], *self.ends, "Delay in control steps."
+            yield ModelRow(*row, *effect)
 
     def delays(self, given: Mapping[str, Any]) -> Exogenous:
         """Declare the delay, with requested fields."""
-        drawn = self.delay if isinstance(self.delay, Integers) else None
-        real = isinstance(self.delay, float)
+        drawn = self.delay if isinstance(self.delay, Integers | Box) else None
+        real = isinstance(self.delay, float | Box)
         fields: dict[str, Any] = {
-            "default": self.delay if real else self.most,
+            "default": self.delay if isinstance(self.delay, float) else self.ends[1] if real else self.most,
             "distribution": drawn,
-            "bounds": (Box if real else Integers)(self.least, self.most),
+            "bounds": Box(*self.ends) if real else Integers(*map(int, self.ends)),
             "dtype": "real" if real else "integer",
             "doc": f"Delay of {self.of.name} in control steps.",
         }
@@ -210,6 +217,28 @@ def with_held(system: Model, channels: Sequence[Channel]) -> Model:
     return dataclasses.replace(system, states=(*own, *held), digest=digest)
 
 
+@lru_cache(maxsize=4096)
+def switched(delay: float, substeps: int) -> tuple[int, tuple[float, ...]]:
+    """Return how many control steps late a command is, and where in a control step it arrives.
+
+    With m whole control steps of delay, u[t - m - 1] acts until the fraction of the delay is over,
+    then u[t - m]. In the physics step in which that happens, both act in proportion to their time.
+
+    Args:
+        delay: In control steps.
+        substeps: How many physics steps a control step has.
+
+    Returns:
+        The number m, and the share of u[t - m - 1] in each physics step; empty if the delay ends
+        with a control step, to a billionth of a physics step.
+    """
+    late = delay * substeps
+    late = round(late) if abs(late - round(late)) < SAME else late
+    whole, rest = divmod(late, substeps)
+    shares = tuple(min(1.0, max(0.0, rest - step)) for step in range(substeps))
+    return int(whole), shares if rest else ()
+
+
 @final
 class Channels(Commands):
     """Delays commands, draws noise, and remembers commands and measurements.
@@ -260,19 +289,23 @@ class Channels(Commands):
         self._spreads = [one.name("noise") for one in noisy]
         self.noisy = {inputs[at]: slice(at, at + 1) for at in self._noisy}
 
-    def command(self, action: Floats, values: Values, vector: Floats, key: NoiseKey) -> Floats:
-        """Return the commands that arrive now, with noise, shape (n_commands,)."""
-        sent = action.copy()
+    def command(
+        self, action: Floats, values: Values, vector: Floats, key: NoiseKey, substeps: int
+    ) -> Floats:
+        """Return the commands that arrive now, with noise; see ``Commands``."""
+        sent, shares = action.copy(), ()
         for index, name, past in self._late:
-            delay = float(values[name]) if name else 0.0
-            whole = int(delay)
+            whole, shares = switched(float(values[name]) if name else 0.0, substeps)
             if whole or not name:
-                sent[index] = vector[past + whole - 1]
-            if delay > whole:
-                sent[index] += (delay - whole) * (vector[past + whole] - sent[index])
+                sent[..., index] = vector[past + whole - 1]
+            if shares:
+                if sent.ndim == 1:
+                    sent = np.repeat(sent[None], substeps, axis=0)
+                change = vector[past + whole] - sent[:, index]
+                sent[:, index] += np.array(shares) * change
         if self._noisy:
             drawn = key.draw(Normal(), "actuators", (len(self._noisy),), {}, "noise")
-            sent[self._noisy] += drawn * [float(values[name]) for name in self._spreads]
+            sent[..., self._noisy] += drawn * [float(values[name]) for name in self._spreads]
         return sent
 
     def held(self, action: Floats, values: Values, vector: Floats, key: NoiseKey) -> Floats | None:

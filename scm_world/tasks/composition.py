@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -58,7 +59,9 @@ class Commands(ABC):
         return True
 
     @abstractmethod
-    def command(self, action: Floats, values: Values, vector: Floats, key: NoiseKey) -> Floats:
+    def command(
+        self, action: Floats, values: Values, vector: Floats, key: NoiseKey, substeps: int
+    ) -> Floats:
         """Return the command of one control step.
 
         Args:
@@ -66,9 +69,11 @@ class Commands(ABC):
             values: Those of everything that physics does not move.
             vector: The state.
             key: Where in the noise this control step draws.
+            substeps: How many physics steps the control step has.
 
         Returns:
-            Shape (n_commands,). It is valid until the next call.
+            Shape (n_commands,), or (substeps, n_commands) if it changes within the control step. It
+            is valid until the next call.
         """
 
     def held(self, action: Floats, values: Values, vector: Floats, key: NoiseKey) -> Floats | None:
@@ -78,6 +83,21 @@ class Commands(ABC):
         None if there are no such states.
         """
         return None
+
+
+def parts(commands: Floats) -> Iterator[tuple[int, Floats]]:
+    """Divide a control step where its commands change.
+
+    Args:
+        commands: Those of each physics step, shape (substeps, …).
+
+    Yields:
+        A number of physics steps, and the commands that are held in them, shape (…).
+    """
+    changes = (commands[1:] != commands[:-1]).reshape(len(commands) - 1, -1).any(axis=1)
+    ends = [0, *(1 + np.flatnonzero(changes)).tolist(), len(commands)]
+    for first, last in pairwise(ends):
+        yield last - first, commands[first]
 
 
 class Composition:

@@ -27,7 +27,7 @@ from scm_world.graph import SCM, NoiseKey, flatten
 from scm_world.models import Difference, Parameters, Scene, Structure
 from scm_world.models.camera import Camera
 from scm_world.tasks import AnySource, Options, Task, make_task
-from scm_world.tasks.composition import Composition
+from scm_world.tasks.composition import Composition, parts
 from scm_world.tasks.model import REWARD
 from scm_world.tasks.rewards import FRACTION, SUCCESS
 from scm_world.variables import Draw, Hard, Intervention, Subset
@@ -413,12 +413,15 @@ class Simulation(CausalSystem):
         if self.acts_alone:
             command, sent, held = self._decided(command)
         row.prepare()
+        moved = False
         try:
-            self.backend.step(sent, self.substeps)
+            for steps, part in ((self.substeps, sent),) if sent.ndim == 1 else parts(sent):
+                self.backend.step(part, steps)
+                moved = True
         except EngineFailure as error:
             left, vector = self.compiled.empty_state(), self.state.vector
             self.backend.read(left)
-            if not error.lost and np.isfinite(left.vector).all():  # the step was not taken
+            if not (moved or error.lost) and np.isfinite(left.vector).all():  # no step was taken
                 raise
             text = str(error)
             if vector.size:
@@ -440,7 +443,7 @@ class Simulation(CausalSystem):
 
         Returns:
             The action after interventions on actions; the backend's command, valid until the next
-            call; and the states that are kept here as they are after the step, None without any.
+            call, see ``Commands.command``; and the states that are kept here as they are after the step, None without any.
         """
         held, key = self._held_actions, self.noise_key(self.index)
         if held:
@@ -454,7 +457,7 @@ class Simulation(CausalSystem):
             return action, action, None
         commands: Any = self.composition.commands
         given = action, self.row, self.state.vector, key
-        return action, commands.command(*given), commands.held(*given)
+        return action, commands.command(*given, self.substeps), commands.held(*given)
 
     # --- interventions ------------------------------------------------------------------------
 
