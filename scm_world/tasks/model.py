@@ -404,10 +404,12 @@ class ModelTask(DeclaredTask):
         )
         late = {channel.of.name for channel in self.channels if channel.acts and channel.ends[0] >= 1}
         effects = {row.name: (row.always, row.contact) for row in acting if row.name not in late}
-        kept = {row.name: c.remembers(row) for c in self.channels for row in c.held()}
-        moving = [row for row in system.states if row.name not in kept]
+        held = {row.name for channel in self.channels for row in channel.held()}
+        moving = [row for row in system.states if row.name not in held]
         causes = causes_of(effects, {row.trees for row in moving})
         parents = {trees: coupled(*own) for trees, own in causes.items()}
+        causing = {row.name: parents[row.trees] for row in moving}
+        kept = {row.name: c.remembers(row, causing) for c in self.channels for row in c.held()}
         for moved in system.states:
             fields, begin = self._fields(moved, "default"), self.start.get(moved.name)
             if moved.name in kept:

@@ -25,7 +25,7 @@ from scm_world.errors import (
 from scm_world.graph import SCM, flatten
 from scm_world.graph.scm import request_of
 from scm_world.runs.processes import cores
-from scm_world.tasks.composition import parts
+from scm_world.tasks.composition import Held, parts
 from scm_world.variables import Hard
 from scm_world.variables.distributions import word_of
 from scm_world.variables.interventions import has_times
@@ -699,7 +699,7 @@ class Batch:
         rows = self._all if which is None else np.flatnonzero(which)
         self._require_states(rows)
         groups, sent = self._groups(rows), commands
-        held: dict[int, Floats] = {}
+        held: dict[int, Held] = {}
         late = dict(within)
         there: Any = self._worlds
         alone = [row for row in self._existing(rows) if there[row].acts_alone]
@@ -714,12 +714,12 @@ class Batch:
                 if row in within:
                     now = [self._decided(row, one)[1].copy() for one in within[row]]
                     late[row] = np.array([c if c.ndim == 1 else c[i] for i, c in enumerate(now)])
-                commands[row], found, numbers = self._decided(row, commands[row])
+                commands[row], found, after = self._decided(row, commands[row])
                 if found.ndim > 1:
                     late.setdefault(row, found.copy())
                 sent[row] = found if found.ndim == 1 else found[-1]
-                if numbers is not None:
-                    held[row] = numbers
+                if after is not None:
+                    held[row] = after
         failed: EngineFailure | None = None
         for (compiled, substeps), members in groups:
             table = self._tables[compiled]
@@ -727,7 +727,7 @@ class Batch:
             kept = table.numbers[members if self._engine.may_refuse else members[:0]]
             table.advance(commands, members)
             try:
-                self._step(members, sent, late, substeps, table.numbers)
+                self._step(members, sent, late, held, substeps, table.numbers)
             except BaseException as error:  # or Ctrl-C: the others were stepped
                 unmoved = error.unmoved if isinstance(error, EngineFailure) else ()
                 for place, row in enumerate(members.tolist()):
@@ -744,8 +744,8 @@ class Batch:
             finally:
                 for row in members.tolist() if held else ():
                     if row in held:
-                        there = slice(compiled.state_size - held[row].size, compiled.state_size)
-                        table.numbers[row, there] = held[row]
+                        numbers, size = held[row].numbers, compiled.state_size
+                        table.numbers[row, size - numbers.size : size] = numbers
         if failed is not None:
             raise failed
         for (compiled, _), members in groups:
@@ -756,6 +756,7 @@ class Batch:
         members: Integers,
         sent: Floats,
         late: Mapping[int, Floats],
+        held: Mapping[int, Held],
         substeps: int,
         into: Floats,
     ) -> None:
@@ -766,20 +767,24 @@ class Batch:
             return
         each = np.repeat(sent[None], substeps, axis=0)
         each[:, mine] = np.stack([late[row] for row in mine], axis=1)
-        going, moved, failed = members, False, None
-        for steps, part in parts(each):
+        going, done, failed = members, 0, None
+        samples = {step for row in mine if row in held for step in held[row].samples}
+        for steps, part in parts(each, samples):
             try:
                 self._engine.step(going, part, steps, into)
             except EngineFailure as error:
-                if moved:  # the control step was taken in part
+                if done:  # the control step was taken in part
                     error.lost, error.unmoved = (*error.lost, *error.unmoved), ()
                 going = np.setdiff1d(going, (*error.lost, *error.unmoved))
                 failed = error.after(failed)
-            moved = True
+            done += steps
+            for row in going.tolist() if done in samples else ():
+                if row in held:
+                    held[row].see(done, into[row])
         if failed is not None:
             raise failed
 
-    def _decided(self, row: int, action: Floats) -> tuple[Floats, Floats, Floats | None]:
+    def _decided(self, row: int, action: Floats) -> tuple[Floats, Floats, Held | None]:
         """Compute what a control step does with an action; see ``Simulation._decided``."""
         world, done = self._worlds[row], self._done[row]
         if world is not None or done is None:
@@ -788,8 +793,8 @@ class Batch:
         key.step = int(own.numbers[done.compiled.clock])
         state = own.numbers[: done.compiled.state_size]
         commands: Any = done.compiled.composition.commands
-        given, substeps = (action, own, state, key), self._kinds[self._kind[row]][1]
-        return action, commands.command(*given, substeps), commands.held(*given)
+        given = action, own, state, key, self._kinds[self._kind[row]][1]
+        return action, commands.command(*given), commands.held(*given)
 
     def _require_states(self, rows: Integers) -> None:
         for row in self._gone.intersection(rows.tolist()) if self._gone else ():
