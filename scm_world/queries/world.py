@@ -452,6 +452,7 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         *,
         noise: Any = None,
         window: int | None = None,
+        begins: Any = None,
         progress: Progress | None = None,
         search: Search | None = None,
     ) -> Fit:
@@ -480,6 +481,9 @@ class World(Planned, _System, Questions, metaclass=_Opener):
             window: Number of rows of a window; if None 50, or 10 where only these explain the
                 recording, which is a remark then. Longer windows determine more, and shorter ones
                 bear more disturbances, contacts and chaos.
+            begins: How the recording begins, where that was not measured: ``"rest"`` (velocities 0,
+                activations at what they follow, the first command, to 0.001), or values and
+                standard deviations by patterns of states, ``{"*.velocity": (0.0, 0.01)}``.
             progress: Called after each round of estimating the noise.
             search: What finds the next minimum of least squares; ``gauss_newton`` if None. See
                 ``scm_world.fit.Search``.
@@ -501,7 +505,7 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         """
         from scm_world.fit import fit
 
-        options: Any = {"noise": noise, "window": window, "progress": progress}
+        options: Any = {"noise": noise, "window": window, "begins": begins, "progress": progress}
         options |= {} if search is None else {"search": search}
         return fit(self, recording, parameters, **options)
 
@@ -514,6 +518,7 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         most: int = 1,
         noise: Any = None,
         window: int | None = None,
+        begins: Any = None,
         progress: Progress | None = None,
     ) -> Deviation:
         """Find which parameter accounts for the deviation of a recording from this world.
@@ -532,6 +537,7 @@ class World(Planned, _System, Questions, metaclass=_Opener):
                 linearisation is fitted, then sets that differ from the best in one parameter.
             noise: See ``fit``.
             window: Number of rows of a window; 50 if None.
+            begins: See ``fit``.
             progress: Called after each fit.
 
         Raises:
@@ -539,8 +545,8 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         """
         from scm_world.fit import explain
 
-        options: Any = {"most": most, "noise": noise, "window": window, "progress": progress}
-        return explain(self, recording, candidates, **options)
+        options: Any = {"most": most, "noise": noise, "window": window, "begins": begins}
+        return explain(self, recording, candidates, progress=progress, **options)
 
     def for_fit(self, recording: object) -> World:
         """Return the world that a fit computes: of equations, that of their step function."""
