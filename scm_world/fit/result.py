@@ -34,7 +34,7 @@ from scm_world.fit.recordings import (
     columns_of,
 )
 from scm_world.fit.shooting import Shooting
-from scm_world.fit.targets import FAR, Target, delays_of, ranges_of, values_of
+from scm_world.fit.targets import FAR, Target, delays_of, free_states, ranges_of, values_of
 from scm_world.geometry.rotations import aligned
 from scm_world.queries.world import World
 from scm_world.runs.canvas import PALETTE, blank, styled
@@ -408,6 +408,13 @@ class Fit:
                 f"{', '.join(names)} {said} by this recording; suggest(1), or --suggest 1 of the "
                 f"command, has an experiment that does it"
             )
+        if self.asked.substeps == 1:
+            found += [
+                f"{target.name}: a control step has one physics step, in which a delay that ends "
+                "there is the mean of two commands"
+                for target in self.targets
+                if target.values is None
+            ]
         if self.shortened:
             found.append(
                 f"windows of {WINDOW} rows do not explain the recording, those of {self.window} "
@@ -439,7 +446,7 @@ class Fit:
             return []
         known, places = {c.variable for c in self.columns}, columns_of(self.asked)
         spans, found = np.full(self.starts.shape[1], np.inf), list[str]()
-        spans[np.flatnonzero(self.asked.structure.layout.can_be_set)] = self.spans
+        spans[free_states(self.asked)] = self.spans
         for start, window in zip(self.starts, windows_of(self.runs, self.window), strict=True):
             run = self.runs[window.run]
             for name, rest in at_rest(self.asked, run).items() if not window.first else ():

@@ -14,9 +14,17 @@ from scm_world._types import Floats, Integers
 from scm_world.errors import EngineFailure
 from scm_world.fit.problem import SHORT, STEP, Simulated, Simulator, Window
 from scm_world.fit.recordings import LEAST, Measurements, RecordedRun, rotations_of
-from scm_world.fit.targets import Target, begin, delays_of, values_of
+from scm_world.fit.targets import (
+    Target,
+    begin,
+    delays_of,
+    free_states,
+    remembered,
+    values_of,
+)
 from scm_world.geometry.rotations import aligned
 from scm_world.models import Difference
+from scm_world.models.model import HELD
 from scm_world.models.scene import SURFACES
 from scm_world.queries.twins import twins_of
 from scm_world.queries.world import World
@@ -56,7 +64,10 @@ class Shooting(Simulator):
         self._batch = self._open.enter_context(together)
         self._reset()
         first = self._batch.world(0)
-        self.free = np.flatnonzero(first.structure.layout.can_be_set)
+        self.free = free_states(first)
+        held = (row for row in first.composition.system.states if getattr(row, "array", "") == HELD)
+        layout = first.structure.layout.slices  # of what the world keeps by itself
+        self._held = [i for row in held for i in range(layout[row.name].start, layout[row.name].stop)]
         self.turned = [
             where
             for name, where in first.compiled.slices.items()
@@ -130,6 +141,9 @@ class Shooting(Simulator):
                     turns = back * turned if frame == "body" else turned * back
                     vector[speed] = np.polyfit(time - time[0], turns.as_rotvec(), 1)[0]
                     mine[speed] = True
+            for i, past in remembered(world).items() if len(run.commands) else ():
+                sent = run.instants[first] - 1 - np.arange(past.stop - past.start)
+                vector[past], mine[past] = run.commands[np.maximum(sent, 0), i], True
             for place, i in begun if not first and run.whole else ():
                 vector[place], mine[place] = run.values[0, i], True
             for turned_places in self.turned:
@@ -216,6 +230,7 @@ class Shooting(Simulator):
         """Put a twin into a state, which measurements with noise may put out of its bounds."""
         world.backend.apply(Difference(state=world.compiled.empty_state(vector.copy())))
         world.backend.read(world.state)
+        world.state.vector[self._held] = vector[self._held]
         world.version += 1
 
     def _reset(self) -> None:

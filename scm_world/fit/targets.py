@@ -11,7 +11,7 @@ from typing import final
 import numpy as np
 
 from scm_world._patterns import as_names, fitting
-from scm_world._types import ArrayLike, Floats
+from scm_world._types import ArrayLike, Floats, Integers
 from scm_world.errors import NotIntervenable, UnknownVariable
 from scm_world.fit.recordings import MeasuredNumber, labels
 from scm_world.queries.twins import twins_of
@@ -98,6 +98,21 @@ def delays_of(world: Simulation, targets: Sequence[Target], scaled: Floats) -> F
         if target.values is None:
             delays[world.compiled.actions.get(target.name.removesuffix(LATE), slice(None))] += steps
     return delays
+
+
+def remembered(world: Simulation) -> dict[int, slice]:
+    """Return where in the state past commands are, the latest first, by number of the action."""
+    compiled = world.compiled
+    names = ((at.start, f"{name}_past") for name, at in compiled.actions.items())
+    return {i: compiled.slices[name] for i, name in names if name in compiled.slices}
+
+
+def free_states(world: Simulation) -> Integers:
+    """Return the numbers of the state that a fit moves: all but those that follow from commands."""
+    free = world.structure.layout.can_be_set.copy()
+    for where in remembered(world).values():
+        free[where] = False
+    return np.flatnonzero(free)
 
 
 def ranges_of(targets: Sequence[Target]) -> tuple[Floats, Floats]:
