@@ -67,7 +67,9 @@ class Shooting(Simulator):
         self.free = free_states(first)
         held = (row for row in first.composition.system.states if getattr(row, "array", "") == HELD)
         layout = first.structure.layout.slices  # of what the world keeps by itself
-        self._held = [i for row in held for i in range(layout[row.name].start, layout[row.name].stop)]
+        self._held = [
+            i for row in held for i in range(layout[row.name].start, layout[row.name].stop)
+        ]
         self.turned = [
             where
             for name, where in first.compiled.slices.items()

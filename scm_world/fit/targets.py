@@ -140,10 +140,8 @@ def targets_of(world: Simulation, patterns: Iterable[str]) -> tuple[Target, ...]
     parts = {label: n for n in known for label in labels(n, model.declared(n).shape)}
     names = dict[str, None]()
     refused = world.composition.system.refused
-    late = {f"{name}{LATE}": None for name in world.compiled.actions}
-    if world.compiled.n_actions:
-        late[DELAY] = None
-    late = {name for name in late if name not in model}
+    late = {f"{name}{LATE}" for name in world.compiled.actions}.difference(model)
+    late |= {DELAY}.difference(model) if world.compiled.n_actions else set()
     held = [name for name in world.compiled.actions if f"{name}_past" in model]
     for pattern in given:
         if not isinstance(pattern, str):

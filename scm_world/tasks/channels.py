@@ -83,7 +83,8 @@ class Channel:
         1 or more, which reaches nothing at once; the longest one is a whole number.
         """
         if isinstance(self.delay, Integers | Box):
-            return float(self.delay.low), float(self.delay.high)
+            low, high = cast(tuple[float, float], (self.delay.low, self.delay.high))
+            return float(low), float(high)
         return float(self.acts and (self.delay or 0) >= 1), float(ceil(self.delay or 0))
 
     @property
@@ -313,7 +314,7 @@ class Channels(Commands):
         self, action: Floats, values: Values, vector: Floats, key: NoiseKey, substeps: int
     ) -> Floats:
         """Return the commands that arrive now, with noise; see ``Commands``."""
-        sent, shares = action.copy(), ()
+        sent = action.copy()
         if self._samples(values, substeps):
             sent = np.repeat(sent[None], substeps, axis=0)
         for index, name, past in self._late:
@@ -387,7 +388,7 @@ def _noisy(value: Value, spread: Value, error: Value) -> Any:
 @njit(cache=True)
 def _steps(delay: Value, index: Value) -> int:
     """Return which past value is read; in the first control steps there are fewer."""
-    return int(ceil(min(scalar(delay), scalar(index)) - SAME))
+    return ceil(min(scalar(delay), scalar(index)) - SAME)
 
 
 @njit(cache=True)

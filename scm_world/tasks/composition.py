@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from scm_world._types import Floats, Integers, Value, Values
+from scm_world._types import Floats, Value, Values
+from scm_world._types import Integers as Places
 from scm_world.geometry.hulls import Hull
 from scm_world.geometry.numbers import njit, scalar
 from scm_world.graph import NoiseKey
@@ -54,7 +55,7 @@ class Held:
     """
 
     numbers: Floats
-    samples: Mapping[int, tuple[Integers, Floats]]
+    samples: Mapping[int, tuple[Places, Floats]]
     read: Callable[[Floats], Floats]
 
     def see(self, step: int, vector: Floats) -> None:

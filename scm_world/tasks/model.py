@@ -402,7 +402,9 @@ class ModelTask(DeclaredTask):
             *system.inputs,
             *own,
         )
-        late = {channel.of.name for channel in self.channels if channel.acts and channel.ends[0] >= 1}
+        late = {
+            channel.of.name for channel in self.channels if channel.acts and channel.ends[0] >= 1
+        }
         effects = {row.name: (row.always, row.contact) for row in acting if row.name not in late}
         held = {row.name for channel in self.channels for row in channel.held()}
         moving = [row for row in system.states if row.name not in held]

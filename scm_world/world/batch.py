@@ -700,26 +700,13 @@ class Batch:
         self._require_states(rows)
         groups, sent = self._groups(rows), commands
         held: dict[int, Held] = {}
-        late = dict(within)
+        late: Mapping[int, Floats] = within
         there: Any = self._worlds
         alone = [row for row in self._existing(rows) if there[row].acts_alone]
         alone += rows[self._acts_alone[rows]].tolist()
         if alone:
-            commands = commands.copy()
-            sent = np.zeros((len(self), self._first.structure.n_commands))
             others = np.setdiff1d(rows, alone)
-            if others.size:  # none, and a row of commands may be of another size
-                sent[others] = commands[others]
-            for row in alone:
-                if row in within:
-                    now = [self._decided(row, one)[1].copy() for one in within[row]]
-                    late[row] = np.array([c if c.ndim == 1 else c[i] for i, c in enumerate(now)])
-                commands[row], found, after = self._decided(row, commands[row])
-                if found.ndim > 1:
-                    late.setdefault(row, found.copy())
-                sent[row] = found if found.ndim == 1 else found[-1]
-                if after is not None:
-                    held[row] = after
+            commands, sent, late, held = self._decide(alone, others, commands, within)
         failed: EngineFailure | None = None
         for (compiled, substeps), members in groups:
             table = self._tables[compiled]
@@ -750,6 +737,26 @@ class Batch:
             raise failed
         for (compiled, _), members in groups:
             self._tables[compiled].evaluate(self._names, members)
+
+    def _decide(
+        self, alone: list[int], others: Integers, commands: Floats, within: Mapping[int, Floats]
+    ) -> tuple[Floats, Floats, dict[int, Floats], dict[int, Held]]:
+        """Return actions, commands, those of each physics step, and what worlds keep; see above."""
+        commands, late, held = commands.copy(), dict(within), dict[int, Held]()
+        sent = np.zeros((len(self), self._first.structure.n_commands))
+        if others.size:  # none, and a row of commands may be of another size
+            sent[others] = commands[others]
+        for row in alone:
+            if row in within:
+                now = [self._decided(row, one)[1].copy() for one in within[row]]
+                late[row] = np.array([c if c.ndim == 1 else c[i] for i, c in enumerate(now)])
+            commands[row], found, after = self._decided(row, commands[row])
+            if found.ndim > 1:
+                late.setdefault(row, found.copy())
+            sent[row] = found if found.ndim == 1 else found[-1]
+            if after is not None:
+                held[row] = after
+        return commands, sent, late, held
 
     def _step(
         self,

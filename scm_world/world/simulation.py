@@ -457,7 +457,8 @@ class Simulation(CausalSystem):
 
         Returns:
             The action after interventions on actions; the backend's command, valid until the next
-            call, see ``Commands.command``; and the states that are kept here as they are after the step, None without any.
+            call, see ``Commands.command``; and the states that are kept here as they are after the
+            step, None without any.
         """
         held, key = self._held_actions, self.noise_key(self.index)
         if held:
