@@ -36,7 +36,15 @@ from scm_world.fit.recordings import (
     read_recording,
 )
 from scm_world.fit.shooting import Shooting
-from scm_world.fit.targets import FAR, Target, delay_of, ranges_of, twin_of, values_of
+from scm_world.fit.targets import (
+    FAR,
+    Target,
+    delays_of,
+    free_states,
+    ranges_of,
+    twin_of,
+    values_of,
+)
 from scm_world.geometry.rotations import aligned
 from scm_world.queries.world import World
 from scm_world.runs.canvas import PALETTE, blank, styled
@@ -132,16 +140,16 @@ class Fit:
         (``motor.control_delay``), so that the world replays the recording.
 
         Raises:
-            UnknownOption: A delay was fitted beside commands that have one already.
             ModelError: A delay was fitted to a step function.
         """
-        world, late = self.asked, delay_of(self.targets, self.scaled)
-        if late:
+        world, late = self.asked, delays_of(self.asked, self.targets, self.scaled)
+        if late.any():
             build, (kind, task, options, _), *_ = world.__reduce__()
             if not isinstance(task, ModelTask):
-                problem = f"its commands cannot be delayed by {late:.3g} control steps"
+                problem = f"its commands cannot be delayed by {late.max():.3g} control steps"
                 raise ModelError([f"{problem}: delay them in the step function, or before it"])
-            world = build(kind, task.delayed(late), options, None)
+            each = {n: late[at].max() for n, at in world.compiled.actions.items()}
+            world = build(kind, task.delayed(each), options, None)
             world._given = self.asked._given
         return world.given(values_of(self.targets, self.scaled))
 
@@ -485,6 +493,13 @@ class Fit:
                 f"{', '.join(names)} {said} by this recording; suggest(1), or --suggest 1 of the "
                 f"command, has an experiment that does it"
             )
+        if self.asked.substeps == 1:
+            found += [
+                f"{target.name}: a control step has one physics step, in which a delay that ends "
+                "there is the mean of two commands"
+                for target in self.targets
+                if target.values is None
+            ]
         if self.shortened:
             found.append(
                 f"windows of {WINDOW} rows do not explain the recording, those of {self.window} "
@@ -516,7 +531,7 @@ class Fit:
             return []
         known, places = {c.variable for c in self.columns}, columns_of(self.asked)
         spans, found = np.full(self.starts.shape[1], np.inf), list[str]()
-        spans[np.flatnonzero(self.asked.structure.layout.can_be_set)] = self.spans
+        spans[free_states(self.asked)] = self.spans
         for start, window in zip(self.starts, windows_of(self.runs, self.window), strict=True):
             run = self.runs[window.run]
             for name, rest in at_rest(self.asked, run).items() if not window.first else ():

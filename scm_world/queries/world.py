@@ -7,6 +7,7 @@ from abc import ABCMeta, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, final
 
 import networkx as nx
@@ -115,7 +116,6 @@ class Planned(CausalSystem):
         region, asked = as_region("space", space), request_of(do)
         super().reset(seed=seed, episode=episode)
         self._follow(_Schedule())
-        self.requested = {}
         context = do.context if isinstance(do, Plan) else ()
         if not (len(self._given) or context or has_times(asked)):
             return self.do(asked, space=space) if asked else None
@@ -138,13 +138,15 @@ class Planned(CausalSystem):
         makes of the variable now, and ``Natural`` shows that. Where a plan acts on the same
         variable at this instant, this intervention counts.
         """
+        system: Any = super()
         if not self.is_planned or has_times(request):
-            return self._doing(**options)(request)
+            return system.do(request, **options)  # type: ignore[no-any-return]
+        doing: Callable[..., Audit] = partial(system.do, **options)
         try:
             flat = self.model.named(flatten(request))
             acts = {name: self.model.accept(name, value) for name, value in flat.items()}
         except InterventionError:
-            return self._doing(**options)(request)  # which names every problem
+            return doing(request)  # which names every problem
         now, step = self._schedule, self.index
         plan = now.plan._replacing(
             {n: retimed(act, at=step) for n, act in acts.items()}, self.model
@@ -152,19 +154,9 @@ class Planned(CausalSystem):
         memory = now.memory.copy()
         for name in acts:
             memory.forget(name, step)
-        audit = plan._act(self, step, memory, self._doing(**options), acts)
+        audit = plan._act(self, step, memory, doing, acts)
         self._schedule = now._replace(plan=plan, memory=memory)
-        return audit or self._doing(**options)({})
-
-    def _doing(self, **options: object) -> Callable[[Mapping[str, Any]], Audit]:
-        system: Any = super()
-
-        def do(request: Mapping[str, Any], **more: object) -> Audit:
-            audit: Audit = system.do(request, **options, **more)
-            self.requested = request
-            return audit
-
-        return do
+        return audit or doing({})
 
     def step(self, action: ArrayLike) -> None:
         """Advance one control step, after its planned interventions; see ``Simulation.step``.
@@ -209,7 +201,8 @@ class Planned(CausalSystem):
         if not self._may_act(step):
             return None
         memory = now.memory.copy()
-        audit = now.plan._act(self, step, memory, self._doing(space=now.space))
+        system: Any = super()
+        audit = now.plan._act(self, step, memory, partial(system.do, space=now.space))
         self._schedule = now._replace(memory=memory, acted=step)
         return audit
 

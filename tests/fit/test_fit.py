@@ -295,7 +295,7 @@ def test_a_delay_of_commands_is_fitted(world: sw.World) -> None:
 
 
 def test_a_fitted_delay_is_one_of_the_commands_of_the_fitted_world(world: sw.World) -> None:
-    """It replays the recording; a second delay of the commands is refused."""
+    """It replays the recording; beside a delay that commands have, it is refused."""
     late = sw.World(PENDULUM, delay={"motor.control": 1.4})
     fit = world.fit(recording := late.rollout("random", seed=1, steps=60), "delay")
     assert fit.values["delay"] == pytest.approx(0.028, abs=1e-4)
@@ -304,11 +304,16 @@ def test_a_fitted_delay_is_one_of_the_commands_of_the_fitted_world(world: sw.Wor
     fit.world.reset(seed=0)
     assert float(fit.world["motor.control_delay"]) == pytest.approx(1.4, abs=5e-3)
     later = sw.World(PENDULUM, delay={"motor.control": 2.4})
-    run = later.rollout("random", seed=1, steps=30)
+    sent = np.random.default_rng(0).uniform(-1.0, 1.0, (30, 1))
+    sent[:3] = 0.0  # the first command, which held before
+    run = later.rollout(sent, steps=30)
     given = {"time": 0.02 * np.arange(31), "motor.control": run.actions[:, 0]}
-    second = late.fit({**given, "hinge.position": run["hinge.position"]}, "delay")
-    with pytest.raises(UnknownOption, match="have a delay already"):
-        _ = second.world
+    table = {**given, "hinge.position": run["hinge.position"]}
+    with pytest.raises(NotIntervenable, match=r"have already; fit motor\.control_delay"):
+        late.fit(table, "delay")
+    own = sw.World(PENDULUM, delay={"motor.control": sw.Box(0.0, 3.0)})
+    second = own.given({"motor.control_delay": 1.0}).fit(table, "motor.control_delay")
+    assert second.values["motor.control_delay"] == pytest.approx(2.4, abs=1e-4)
 
 
 def test_the_size_of_a_body_that_lies_is_fitted() -> None:
