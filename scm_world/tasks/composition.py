@@ -121,7 +121,7 @@ def parts(commands: Floats, also: Iterable[int] = ()) -> Iterator[tuple[int, Flo
     Yields:
         A number of physics steps, and the commands that are held in them, shape (…).
     """
-    changes = (commands[1:] != commands[:-1]).reshape(len(commands) - 1, -1).any(axis=1)
+    changes = (commands[1:] != commands[:-1]).any(axis=tuple(range(1, commands.ndim)))
     ends = {0, *(1 + np.flatnonzero(changes)).tolist(), *also, len(commands)}
     for first, last in pairwise(sorted(ends)):
         yield last - first, commands[first]

@@ -174,6 +174,19 @@ class Tired(BackendWrapper):
         super().step(command, substeps)
 
 
+def test_a_control_step_of_one_physics_step_is_not_divided() -> None:
+    """A delay that ends within it is the mean of both commands."""
+    noise, seen = {"s.control": 0.01}, []
+    for delay, sent in (
+        (1.25, COMMANDS),
+        (1, 0.75 * COMMANDS + 0.25 * np.append(0, COMMANDS[:-1])),
+    ):
+        with sw.World(ARM, control_dt=0.002, delay={"s.control": delay}, noise=noise) as world:
+            seen.append(world.rollout(sent[:, None], seed=0, steps=STEPS)["j.position"])
+            assert sw.verify(world, probes=4).undeclared == ()
+    assert np.allclose(*seen, rtol=0.0, atol=1e-15)
+
+
 def test_a_world_whose_control_step_ends_half_way_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
     """An engine that refuses the second part of a control step has moved already."""
     options: dict[str, Any] = {"backend": "tired", "delay": {"s.control": 0.5}}
