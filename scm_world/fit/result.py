@@ -493,7 +493,7 @@ class Fit:
                 f"{', '.join(names)} {said} by this recording; suggest(1), or --suggest 1 of the "
                 f"command, has an experiment that does it"
             )
-        if self.asked.substeps == 1:
+        if self.asked is not None and self.asked.substeps == 1:
             found += [
                 f"{target.name}: a control step has one physics step, in which a delay that ends "
                 "there is the mean of two commands"
