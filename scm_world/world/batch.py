@@ -165,7 +165,7 @@ class Batch:
                 self._versions[row] = world.version
             world._closed |= self._is_closed
             self._worlds[row], self._exists[row] = world, True
-            self._done[row], self._acts_alone[row] = None, False
+            self._done[row], self._acts_alone[row] = None, world.acts_alone
         return world
 
     def _new(self, **options: Any) -> Simulation:
@@ -674,10 +674,15 @@ class Batch:
         """Return the rows of some worlds by structure, with the numbers of these worlds."""
         return [(self._tables[kind[0]], members) for kind, members in self._groups(rows)]
 
-    def advance(self, commands: Floats, which: Mask | None = None) -> None:
+    def advance(
+        self, commands: Floats, which: Mask | None = None
+    ) -> list[tuple[Rows, Integers]]:
         """Advance worlds one control step, all if ``which`` is None; see ``Simulation.advance``.
 
         Commands are finite numbers within the bounds, shape (n, n_actions).
+
+        Returns:
+            The rows of each structure, with the numbers of its worlds that were stepped.
 
         Raises:
             NotReset: No episode has begun in one of the worlds.
@@ -689,9 +694,7 @@ class Batch:
         self._require_states(rows)
         groups, sent = self._groups(rows), commands
         held: dict[int, Floats] = {}
-        there: Any = self._worlds
-        alone = [row for row in self._existing(rows) if there[row].acts_alone]
-        alone += rows[self._acts_alone[rows]].tolist()
+        alone = rows[self._acts_alone[rows]].tolist()
         if alone:
             commands = commands.copy()
             sent = np.zeros((len(self), self._first.structure.n_commands))
@@ -730,8 +733,10 @@ class Batch:
                         table.numbers[row, there] = held[row]
         if failed is not None:
             raise failed
-        for (compiled, _), members in groups:
-            self._tables[compiled].evaluate(self._names, members)
+        stepped = [(self._tables[compiled], members) for (compiled, _), members in groups]
+        for table, members in stepped:
+            table.evaluate(self._names, members)
+        return stepped
 
     def _decided(self, row: int, action: Floats) -> tuple[Floats, Floats, Floats | None]:
         """Compute what a control step does with an action; see ``Simulation._decided``."""
@@ -779,6 +784,7 @@ class Batch:
         world = self._alone(row)
         world._require_episode()
         self._kind[row] = self._number((world.compiled, world.substeps))
+        self._acts_alone[row] = world.acts_alone
         table = self._tables[world.compiled]
         if world.row.numbers.base is not table.numbers:
             world.move(table.row(row))
