@@ -11,11 +11,12 @@ from typing import Any, final
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import iterate
 
 from scm_world._arguments import one_of, true_or_false, typed, whole_number
-from scm_world._types import Floats, Integers, Mask
+from scm_world._types import ArrayLike, Floats, Integers, Mask
 from scm_world.env.actions import JOINTS
 from scm_world.env.arguments import RESETS, reset_options
 from scm_world.env.environment import EnvSnapshot, ScmWorldEnv, unwrapped_env
@@ -37,8 +38,17 @@ from scm_world.world import Audit
 from scm_world.world.batch import located, read_actions, read_mask, read_seeds
 from scm_world.world.mechanisms import Rows
 
-WHOLE: Any = slice(None)
+WHOLE = slice(None)
 """All rows."""
+
+Places = int | Integers | slice
+"""One row, or several."""
+
+Seeds = int | Sequence[int | None] | None
+"""A seed that counts up, or one for each."""
+
+OfEach = Mapping[Any, Any] | Sequence[Any]
+"""One for each in a list, or some by index; or one mapping for all."""
 
 Stepped = tuple[Any, Floats, Mask, Mask, dict[str, Any]]
 
@@ -92,8 +102,8 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         self._how: dict[str, Any] = {"num_envs": count, "copy": copy, "threads": threads}
         self._how |= {"autoreset_mode": mode_of(autoreset_mode), "member": member, **options}
         with blamed("member"):
-            first: Any = member(**options)
-            lead: Any = first.unwrapped
+            first = member(**options)
+            lead = unwrapped_env(first, "a batch")
         # They share declarations, and each can be made again by itself.
         shared = {**options, "task": lead.world.structures, "task_options": None}
         makers: list[Any] = [lambda: first, *[partial(member, **shared)] * (count - 1)]
@@ -105,14 +115,14 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         self._known: dict[str, Any] = {}  # a column of all environments for each entry of ``info``
         reads = lead.actions.reads
         self._names = (*lead.observer.needed, *(() if reads is None else (reads,)))
-        worlds = [inner.world for inner in self._inner]
+        worlds: list[Any] = [inner.world for inner in self._inner]
         self._batch = worlds[0].batched(worlds, threads=threads, names=self._names)
         self._counting = hasattr(first, "over")
 
     # --- episodes ---------------------------------------------------------------------------------
 
     def reset(
-        self, *, seed: Any = None, options: dict[str, Any] | None = None
+        self, *, seed: Seeds = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode in all environments, or in some; all of those are reset, or none.
 
@@ -146,7 +156,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
             raise
         self._autoreset_envs[[*asked]] = False
 
-    def step(self, actions: Any) -> Stepped:
+    def step(self, actions: ArrayLike) -> Stepped:
         """Advance all environments one control step.
 
         If an action is refused, none moves. If one environment fails as it is stepped, all others
@@ -212,8 +222,9 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         commands = self._commanded(rows, actions)
         before = self._batch._by_structure(rows) if self._inner[0].truncates_failures else []
         kept = [table.numbers[members] for table, members in before]
+        moved = rows
         try:
-            stepped = self._batch.advance(commands, which)
+            self._batch.advance(commands, which)
         except (FunctionFailure, EngineFailure) as error:
             if not (kept and isinstance(error, EngineFailure) and error.diverged):
                 self._read_alone(rows.tolist())
@@ -226,10 +237,10 @@ class ScmWorldVectorEnv(SyncVectorEnv):
                 self._write(row, *self._inner[row].present_of_failure())
             self._rewards[failed] = 0.0
             self._terminations[failed], self._truncations[failed] = False, True
-            stepped = self._batch._by_structure(np.setdiff1d(rows, failed))
-            for table, members in stepped:
+            moved = np.setdiff1d(rows, failed)
+        for table, members in self._batch._by_structure(moved):
+            if moved is not rows:
                 table.evaluate(self._names, members)
-        for table, members in stepped:
             self._take(table, members)
         ended = self._terminations | self._truncations
         for row in rows.tolist():
@@ -242,7 +253,8 @@ class ScmWorldVectorEnv(SyncVectorEnv):
 
     def _take(self, table: Rows, rows: Integers) -> None:
         """Write what a step led to in environments of one structure."""
-        lead, now, place = self._inner[int(rows[0])], table, WHOLE
+        lead, now = self._inner[int(rows[0])], table
+        place: Places = WHOLE
         if len(rows) < self.num_envs:
             now, place = Rows(table.compiled, table.numbers[rows]), rows
         lead.follow()
@@ -333,7 +345,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         self._write(row, *shown)
         return answer
 
-    def _write(self, rows: Any, observation: Any, info: Mapping[str, Any]) -> None:
+    def _write(self, rows: Places, observation: Any, info: Mapping[str, Any]) -> None:
         if isinstance(observation, dict):
             _put(self._observations, rows, observation, self.num_envs)
         elif observation is not None:
@@ -352,7 +364,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         self._read_alone(range(self.num_envs))
         return self._shown(), infos_of(self._known, np.ones(self.num_envs, bool))
 
-    def do(self, requests: Any, *, space: AnyRegion | None = None) -> dict[int, Audit]:
+    def do(self, requests: OfEach, *, space: AnyRegion | None = None) -> dict[int, Audit]:
         """Intervene now, in all environments that are named or in none; see ``ScmWorldEnv.do``.
 
         Args:
@@ -383,7 +395,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         found: EnvSnapshot = self.envs[index].get_wrapper_attr("snapshot")()
         return replace(found, ended=bool(self._autoreset_envs[index]))
 
-    def restore(self, snapshot: Any) -> None:
+    def restore(self, snapshot: EnvSnapshot | OfEach) -> None:
         """Restore a snapshot, bit for bit; see ``ScmWorldEnv.restore``.
 
         Args:
@@ -412,7 +424,9 @@ class ScmWorldVectorEnv(SyncVectorEnv):
             self.restore({index_of(index, self.num_envs): saved for index in others})
 
 
-def _copied(how: Mapping[str, Any], saved: Mapping[int, EnvSnapshot], spec: Any) -> Any:
+def _copied(
+    how: Mapping[str, Any], saved: Mapping[int, EnvSnapshot], spec: EnvSpec | None
+) -> ScmWorldVectorEnv:
     made = ScmWorldVectorEnv(**how)
     made.spec = spec
     if saved:
@@ -430,7 +444,7 @@ def _shapes(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
     return {**env.get_wrapper_attr("info_shapes"), **{n: part.shape for n, part in parts.items()}}
 
 
-def _put(columns: dict[str, Any], rows: Any, values: Mapping[str, Any], size: int) -> None:
+def _put(columns: dict[str, Any], rows: Places, values: Mapping[str, Any], size: int) -> None:
     """Write one row of columns, or several; columns that are missing begin as zeros."""
     for name, value in values.items():
         if isinstance(value, dict):
@@ -468,7 +482,9 @@ def _without_do(arguments: Mapping[str, Any]) -> dict[str, Any]:
     return {**arguments, "options": {n: one for n, one in options.items() if n != "do"}}
 
 
-def spread(what: str, given: Any, size: int, among: Iterable[int] | None = None) -> dict[int, Any]:
+def spread(
+    what: str, given: object, size: int, among: Iterable[int] | None = None
+) -> dict[int, Any]:
     """Return the request for each environment.
 
     Example:
@@ -492,9 +508,8 @@ def spread(what: str, given: Any, size: int, among: Iterable[int] | None = None)
     return {index: given[index] for index in known if given[index] is not None}
 
 
-def index_of(index: Any, size: int) -> int:
+def index_of(index: object, size: int) -> int:
     """Read the index of an environment."""
-    is_whole = isinstance(index, int | np.integer) and not isinstance(index, bool)
-    if not is_whole or not 0 <= index < size:
+    if not isinstance(index, int | np.integer) or isinstance(index, bool) or not 0 <= index < size:
         raise UnknownOption("environment", index, (f"any whole number from 0 to {size - 1}",))
     return int(index)

@@ -24,6 +24,7 @@ from scm_world.errors import (
 from scm_world.graph import SCM, flatten
 from scm_world.graph.scm import request_of
 from scm_world.runs.processes import cores
+from scm_world.tasks import AnySource
 from scm_world.variables import Hard
 from scm_world.variables.distributions import word_of
 from scm_world.variables.interventions import has_times
@@ -67,7 +68,6 @@ class Batch:
     """
 
     @typed
-    @typed
     def __init__(
         self, worlds: Sequence[Simulation], *, threads: int | None = None, names: Iterable[str] = ()
     ) -> None:
@@ -110,15 +110,15 @@ class Batch:
         self._acts_alone = np.zeros(n, bool)
         self._origin: Snapshot | None = None  # before anything is drawn
         self._changes, self._is_closed = 0, False
-        self._options: Any = None  # of worlds that do not exist yet
-        self._make: Any = None  # makes an empty backend for one
+        self._options: Mapping[str, Any] | None = None  # of worlds that do not exist yet
+        self._make = partial(make_backend, first.backend.name)  # an empty backend for one
 
     @classmethod
     def _of(
         cls,
         kind: type[Simulation],
         num_worlds: int,
-        task: Any = "pushing",
+        task: AnySource = "pushing",
         *,
         threads: int | None = None,
         **options: Any,
@@ -148,7 +148,6 @@ class Batch:
         made = cls.__new__(cls)
         made._set_up(first, [None] * n, n, threads, names)
         made._options = {n: value for n, value in options.items() if n not in ("backend", "device")}
-        made._make = partial(make_backend, first.backend.name)
         made._engine = first.backend.batch.made_by(made._make, n, made._threads)
         return made
 
@@ -157,7 +156,7 @@ class Batch:
         world = self._worlds[row]
         if world is None:
             backend = self._engine.alone(row, self._make, is_built=bool(self._built[row]))
-            world = self._new(**self._options, backend=backend)
+            world = self._new(**(self._options or {}), backend=backend)
             done = self._done[row]
             if done is not None and self._origin is not None:
                 own = self._tables[done.compiled].row(row)
@@ -217,7 +216,7 @@ class Batch:
             found[row] = self._alone(row).index
         return found
 
-    def values(self, *, where: Any = None) -> dict[str, Value]:
+    def values(self, *, where: Mask | None = None) -> dict[str, Value]:
         """Return the present values of all variables that the selected worlds have.
 
         Args:
@@ -246,7 +245,7 @@ class Batch:
         self,
         *,
         seed: int | Sequence[int | None] | None = None,
-        where: Any = None,
+        where: Mask | None = None,
         do: Mapping[str, Any] | None = None,
         space: AnyRegion | None = None,
     ) -> Audits:
@@ -416,7 +415,7 @@ class Batch:
         self,
         request: Mapping[str, Any],
         *,
-        where: Any = None,
+        where: Mask | None = None,
         space: AnyRegion | None = None,
         on_refusal: Literal["raise", "skip"] = "raise",
     ) -> Audits:
@@ -621,7 +620,7 @@ class Batch:
                 raise
         return found
 
-    def step(self, actions: ArrayLike, *, where: Any = None) -> None:
+    def step(self, actions: ArrayLike, *, where: Mask | None = None) -> None:
         """Advance some worlds one control step.
 
         Args:
@@ -674,15 +673,10 @@ class Batch:
         """Return the rows of some worlds by structure, with the numbers of these worlds."""
         return [(self._tables[kind[0]], members) for kind, members in self._groups(rows)]
 
-    def advance(
-        self, commands: Floats, which: Mask | None = None
-    ) -> list[tuple[Rows, Integers]]:
+    def advance(self, commands: Floats, which: Mask | None = None) -> None:
         """Advance worlds one control step, all if ``which`` is None; see ``Simulation.advance``.
 
         Commands are finite numbers within the bounds, shape (n, n_actions).
-
-        Returns:
-            The rows of each structure, with the numbers of its worlds that were stepped.
 
         Raises:
             NotReset: No episode has begun in one of the worlds.
@@ -733,10 +727,8 @@ class Batch:
                         table.numbers[row, there] = held[row]
         if failed is not None:
             raise failed
-        stepped = [(self._tables[compiled], members) for (compiled, _), members in groups]
-        for table, members in stepped:
-            table.evaluate(self._names, members)
-        return stepped
+        for (compiled, _), members in groups:
+            self._tables[compiled].evaluate(self._names, members)
 
     def _decided(self, row: int, action: Floats) -> tuple[Floats, Floats, Floats | None]:
         """Compute what a control step does with an action; see ``Simulation._decided``."""
@@ -844,7 +836,7 @@ def located(error: ScmWorldError, index: int, what: str) -> ScmWorldError:
     return error
 
 
-def read_seeds(seed: Any, size: int) -> list[Any]:
+def read_seeds(seed: object, size: int) -> list[Any]:
     """Return the seed of each world; one seed counts up."""
     if seed is None:
         return [None] * size
@@ -879,18 +871,20 @@ def of_row(
     return found
 
 
-def read_mask(name: str, mask: Any, size: int) -> Mask:
+def read_mask(name: str, mask: object, size: int) -> Mask:
     """Return a checked boolean mask of worlds; all if None."""
     if mask is None:
         return np.ones(size, bool)
-    read = isinstance(mask, np.ndarray) and mask.shape == (size,) and mask.dtype == np.bool_
-    if not (read and mask.any()):
+    is_array = isinstance(mask, np.ndarray) and mask.dtype == np.bool_ and mask.shape == (size,)
+    if not is_array or not np.asarray(mask).any():
         allowed = (f"an array of {size} truth values, at least one of them true",)
         raise UnknownOption(name, mask, allowed)
     return np.array(mask)
 
 
-def read_actions(actions: Any, which: Mask | None, shape: tuple[int, int], what: str) -> Floats:
+def read_actions(
+    actions: ArrayLike, which: Mask | None, shape: tuple[int, int], what: str
+) -> Floats:
     """Return the checked actions of all worlds, of which ``which`` are stepped, in a shape.
 
     A world is called ``what`` in errors.
