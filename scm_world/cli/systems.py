@@ -494,6 +494,7 @@ def fit(
     parameters: options.Words = None,
     noise: options.Pairs = None,
     window: options.NotNegative = 0,
+    begins: Annotated[list[str] | None, typer.Option(metavar="rest|NAME=VALUE,SD")] = None,
     suggest: options.NotNegative = 0,
     steps: Annotated[int | None, typer.Option(min=2, show_default="the longest run's")] = None,
     limits: Annotated[list[str] | None, typer.Option(metavar="NAME=LOW,HIGH")] = None,
@@ -515,6 +516,8 @@ def fit(
         noise: Standard deviation of a measurement; estimated by default.
         window: Rows of a window, which begins in a fitted state; 0 for 50, or 10 where only these
             explain the recording.
+        begins: How the recordings begin: 'rest', or a state with its standard deviation, such as
+            '*.velocity=0,0.01'; fitted by default.
         suggest: Number of further experiments that are suggested; their commands are written.
         steps: Control steps of a suggested experiment.
         limits: Range that suggested experiments keep, such as '*.velocity=-2,2', besides those of
@@ -529,7 +532,8 @@ def fit(
     experiments: tuple[Any, ...] = ()
     failed = None
     with asked.open(name, task) as (system, folder, engine), console.progress("fits") as tell:
-        given: dict[str, Any] = {"noise": known, "window": size, "progress": tell}
+        began = "rest" if begins == ["rest"] else parse_assignments(begins, "'--begins'") or None
+        given: dict[str, Any] = {"noise": known, "window": size, "begins": began, "progress": tell}
         shown: sw.Fit | sw.Deviation
         if parameters:
             found = shown = system.fit(recordings, parameters, **given)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias, final
 
 import numpy as np
@@ -265,8 +265,10 @@ def _followed(twin: Simulation, commands: Floats, limits: Limits) -> tuple[str, 
 def _planned(fit: Fit, tried: Sequence[Candidate]) -> Measurements:
     """Return a recording of some candidates, without values."""
     steps, size = len(tried[0].commands) + 1, len(fit.columns)
-    runs = [RecordedRun(one.commands, np.arange(steps), np.zeros((steps, size))) for one in tried]
-    return Measurements(tuple(runs), fit.columns, fit.measured.control_dt)
+    values = np.zeros((steps, size))
+    values[1:, len(fit.measured.recorded) :] = np.nan
+    runs = [RecordedRun(one.commands, np.arange(steps), values) for one in tried]
+    return replace(fit.measured, runs=tuple(runs))
 
 
 def unseen(fit: Fit, names: Sequence[str]) -> tuple[str, ...]:

@@ -24,7 +24,7 @@ from scm_world.fit.problem import (
     spread_of,
     windows_of,
 )
-from scm_world.fit.recordings import Measurements, Noise, Recording, read_recording
+from scm_world.fit.recordings import Begins, Measurements, Noise, Recording, begun, read_recording
 from scm_world.fit.result import DETERMINED, Fit
 from scm_world.fit.search import SAME, SEARCHES, Minima, Result, gauss_newton
 from scm_world.fit.shooting import Shooting
@@ -52,12 +52,13 @@ def fit(
     *,
     noise: Noise = None,
     window: int | None = None,
+    begins: Begins = None,
     progress: Progress | None = None,
     search: Search = gauss_newton,
 ) -> Fit:
     """Fit parameters to a recording with any search; see ``World.fit`` and ``Search``."""
     world = world.for_fit(recording)
-    measured, targets = arguments_of(world, recording, as_names(parameters), window)
+    measured, targets = arguments_of(world, recording, as_names(parameters), window, begins)
     count, number = len(measured.cells[0]), len(targets)
     known = measured.given(noise)
     usual = (WINDOW, SHORT, WINDOW) if window is None else (window,)
@@ -65,7 +66,7 @@ def fit(
     for attempt, rows in enumerate(usual, 1):
         with Shooting(world, measured, targets) as shooting:
             states = len(shooting.free)
-            complete = {c.variable for c in measured.columns} >= {*world.compiled.slices}
+            complete = {c.variable for c in measured.recorded} >= {*world.compiled.slices}
             if count < number + (0 if complete else states):
                 needed = number + states * len(windows_of(measured.runs, rows))
                 allowed = (f"at least {needed} measurements for {number} parameters",)
@@ -84,6 +85,7 @@ def arguments_of(
     recording: Recording,
     parameters: Iterable[str] | None,
     window: int | None,
+    begins: Begins = None,
 ) -> tuple[Measurements, tuple[Target, ...]]:
     """Check and read the arguments of a fit; all parameters that act on a measurement if None."""
     if window is not None:
@@ -98,7 +100,8 @@ def arguments_of(
         measured = read_recording(twin, recording)
         asked = acting(twin, measured.columns) if parameters is None else parameters
         targets = targets_of(twin, asked)
-    check_units(world, measured)
+        check_units(world, measured)
+        measured = begun(twin, measured, begins)
     if any(target.values is not None and not target.values.any() for target in targets):
         with Shooting(world, measured, targets) as shooting:
             targets = shooting.seen(windows_of(measured.runs, SHORT))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -40,6 +40,7 @@ LONG = 500  # control steps from row to row, of which one of another unit of tim
 FEW = 5  # measurements of which noise can be estimated
 FLOOR = 1e-6  # least noise, relative to the spread of a column
 LEAST = 1e-9  # least noise
+REST = 1e-3  # standard deviation of a velocity or an activation at rest
 SHOWN = 20  # names that a message lists
 ROUNDING = 1e-3  # of a range, by which commands of a file may exceed it
 UNIT = 10.0  # of a range, which is soft: states that exceed it by more are in another unit
@@ -62,6 +63,9 @@ Recording: TypeAlias = object
 
 Noise: TypeAlias = float | Mapping[str, float | None] | None
 """Standard deviation of the noise: of all columns, by patterns of columns, or None: estimated."""
+
+Begins: TypeAlias = str | Mapping[str, tuple[float, float]] | None
+"""How runs begin: "rest", or values with standard deviations by patterns of states, or unknown."""
 
 Limits: TypeAlias = Mapping[str, tuple[float, float]]
 """Ranges by names or patterns of columns."""
@@ -94,12 +98,14 @@ class RecordedRun:
             from 0, shape (rows,).
         values: Measurements, shape (rows, columns); NaN where nothing was measured.
         begin: Time of its first row [s].
+        whole: Whether it begins with the recording, and not after a gap.
     """
 
     commands: Floats
     instants: Integers
     values: Floats
     begin: float = 0.0
+    whole: bool = True
 
     @cached_property
     def filled(self) -> Floats:
@@ -121,11 +127,18 @@ class Measurements:
         runs: The runs.
         columns: Their measured columns.
         control_dt: Length of a control step [s].
+        begins: Standard deviations of the last columns, which are known where a run begins.
     """
 
     runs: tuple[RecordedRun, ...]
     columns: tuple[MeasuredNumber, ...]
     control_dt: float
+    begins: tuple[float, ...] = ()
+
+    @property
+    def recorded(self) -> tuple[MeasuredNumber, ...]:
+        """The columns that were recorded."""
+        return self.columns[: len(self.columns) - len(self.begins)]
 
     @cached_property
     def values(self) -> Floats:
@@ -164,24 +177,24 @@ class Measurements:
                 to estimate it.
             UnknownVariable: A pattern fits no column.
         """
-        found = np.full(len(self.columns), np.nan)
-        places = {column.name: i for i, column in enumerate(self.columns)}
+        found = np.full(len(self.recorded), np.nan)
+        places = {column.name: i for i, column in enumerate(self.recorded)}
         for pattern, value in (noise if isinstance(noise, Mapping) else {"*": noise}).items():
             if value is None and pattern == "*":
                 continue
             deviation = real_number("noise", value)
             if deviation <= 0.0:
                 raise UnknownOption("noise", value, ("a standard deviation above zero",))
-            whole = [c.name for c in self.columns if fits(c.variable, (pattern,))]
+            whole = [c.name for c in self.recorded if fits(c.variable, (pattern,))]
             for name in whole or fitting(pattern, places):
                 found[places[name]] = deviation
         counts = np.isfinite(self.values).sum(axis=0)
-        for column, given, n in zip(self.columns, found, counts, strict=True):
+        for column, given, n in zip(self.recorded, found, counts, strict=False):
             if n < (FEW if np.isnan(given) else 1):
                 about = f"noise of {column.name}", f"not given: {n} measurements"
                 allowed = f"estimated from at least {FEW} measurements; give noise="
                 raise UnknownOption(*about, (f"{allowed}, or leave it out",))
-        return found
+        return np.append(found, self.begins)
 
 
 def labels(name: str, shape: tuple[int, ...]) -> list[str]:
@@ -224,6 +237,69 @@ def read_recording(world: Simulation, recording: Recording) -> Measurements:
         slack = np.inf if simulated else UNIT
         runs += _runs(world, frame.astype(float), columns, slack, label * (len(frames) > 1))
     return Measurements(tuple(runs), columns, world.options.control_period)
+
+
+def at_rest(world: Simulation, run: RecordedRun) -> dict[str, float]:
+    """Return velocities and activations at rest: 0, or the first command that these follow."""
+    commands, found = commands_of(world, bundles=True), dict[str, float]()
+    for name in _states(world):
+        stem, _, kind = name.rpartition(".")
+        if kind == "activation" or kind.endswith(("velocity", "velocities")):
+            followed = f"{stem}.timeconst" in world.compiled.parameter_keys
+            command = commands.get(f"{stem}.control" if followed and kind == "activation" else "")
+            value = 0.0 if command is None else float(run.commands[0, command.component])
+            found |= dict.fromkeys(labels(name, world.model.declared(name).shape), value)
+    return found
+
+
+def begun(world: Simulation, measured: Measurements, begins: Begins) -> Measurements:
+    """Return a recording that begins as is known, which is a further measurement of its first row.
+
+    Args:
+        world: A twin of the world.
+        measured: The recording.
+        begins: "rest": velocities and activations as ``at_rest``, with a standard deviation of
+            0.001; or values and standard deviations by patterns of states.
+
+    Raises:
+        UnknownOption: It is something else, or a standard deviation is not positive.
+        UnknownVariable: A pattern fits no state.
+    """
+    if begins is None:
+        return measured
+    states = {label for n in _states(world) for label in labels(n, world.model.declared(n).shape)}
+    known, every = columns_of(world), list[dict[str, tuple[float, float]]]()
+    for run in measured.runs:
+        if begins == "rest":
+            rest = at_rest(world, run).items()
+            every.append({name: (value, REST) for name, value in rest})
+        elif isinstance(begins, Mapping):
+            every.append({})
+            for pattern, given in begins.items():
+                pair = np.asarray(given, float)
+                if pair.shape != (2,) or not np.isfinite(pair).all() or pair[1] <= 0.0:
+                    allowed = ("a value and a standard deviation above zero",)
+                    raise UnknownOption(f"begins[{pattern!r}]", given, allowed)
+                value, deviation = map(float, pair)
+                whole = [n for n in known if n in states and fits(known[n].variable, (pattern,))]
+                names = whole or fitting(pattern, states)
+                every[-1] |= dict.fromkeys(names, (value, deviation))
+        else:
+            raise UnknownOption("begins", begins, ("rest", "values and deviations by states"))
+    names = [*every[0]]
+    if not names:
+        raise UnknownOption("begins", begins, ("that of a world with velocities or activations",))
+    runs = list[RecordedRun]()
+    for run, one in zip(measured.runs, every, strict=True):
+        first = np.full((len(run.values), len(names)), np.nan)
+        if run.whole:
+            first[0] = [one[name][0] for name in names]
+        runs.append(replace(run, values=np.hstack([run.values, first])))
+    columns = [known[name]._replace(name=f"{name} at the start") for name in names]
+    deviations = tuple(every[0][name][1] for name in names)
+    return replace(
+        measured, runs=tuple(runs), columns=(*measured.columns, *columns), begins=deviations
+    )
 
 
 def _refuse(problems: Iterable[str], label: str = "") -> None:
@@ -469,7 +545,8 @@ def _runs(
             _refuse([f"{said}, or resample the recording"], label)
         if np.isfinite(values[rows]).any():
             commands = np.repeat(np.clip(sent[rows[:-1]], low, high), repeats, axis=0)
-            yield RecordedRun(commands, instants, values[rows], float(time[rows[0]]))
+            begin, whole = float(time[rows[0]]), not rows[0]
+            yield RecordedRun(commands, instants, values[rows], begin, whole)
 
 
 def _not_rising(time: Floats, dt: float) -> Iterator[str]:

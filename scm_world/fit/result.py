@@ -25,7 +25,14 @@ from scm_world.fit.problem import (
     spread_of,
     windows_of,
 )
-from scm_world.fit.recordings import Limits, MeasuredNumber, Measurements, RecordedRun
+from scm_world.fit.recordings import (
+    Limits,
+    MeasuredNumber,
+    Measurements,
+    RecordedRun,
+    at_rest,
+    columns_of,
+)
 from scm_world.fit.shooting import Shooting
 from scm_world.fit.targets import FAR, Target, delay_of, ranges_of, values_of
 from scm_world.geometry.rotations import aligned
@@ -42,6 +49,7 @@ CONFIDENCE = 0.95
 
 DETERMINED = 0.25  # largest standard error of a determined combination: a share of the value
 MISFIT = 1.5  # least residual that the noise does not explain, in standard deviations of it
+AWAY = 0.5  # of the spread of a state in the recording, at which it is far from rest
 MAIN = 0.3  # least share of a parameter in a combination that is named
 DRAWN = 8  # columns of a picture
 
@@ -374,9 +382,11 @@ class Fit:
         rows = sum(len(run.instants) for run in self.runs)
         time = sum(int(run.instants[-1]) for run in self.runs) * self.measured.control_dt
         runs = "a run" if len(self.runs) == 1 else f"{len(self.runs)} runs"
-        lost = 1.0 - len(self.residual) / (rows * len(self.columns))
+        recorded = self.measured.recorded
+        seen = np.isfinite(self.measured.values[:, : len(recorded)])
+        lost = 1.0 - float(seen.mean())
         rest = f", {100.0 * lost:.2g} % not measured" * (lost > 0.0)
-        columns = f"{len(self.columns)} measured column" + "s" * (len(self.columns) > 1)
+        columns = f"{len(recorded)} measured column" + "s" * (len(recorded) > 1)
         return f"{runs} of {rows} rows, {time:.4g} s, {columns}{rest}"
 
     @property
@@ -407,10 +417,12 @@ class Fit:
             if size >= MISFIT:
                 said = f"the residuals of {name} are {size:.3g} times as large as its noise"
                 shorter = f"; where bodies bump, window={SHORT} may" * (self.window != SHORT)
-                found.append(f"{said}: no values that were found explain them{shorter}")
+                began = "; or it did not begin as begins= says" * bool(self.measured.begins)
+                found.append(f"{said}: no values that were found explain them{shorter}{began}")
         ends = self.table[["low", "high"]].to_numpy(float)
         sure = self.table.determined.to_numpy(bool)
         about = zip(self.targets, self.scaled, ends, sure, strict=True)
+        found += self._far_starts
         for target, number, (low, high), determined in about:
             if determined and low <= target.value(target.low) < target.value(number):
                 unit = f" {target.unit}" * (target.unit not in ("", "1"))
@@ -419,6 +431,30 @@ class Fit:
             if min(number - target.low, target.high - number) < near < abs(number):
                 found.append(f"{target.name} is at the end of its range")
         return tuple(found)
+
+    @property
+    def _far_starts(self) -> list[str]:
+        """Sentences on runs that begin far from rest in what was not measured."""
+        if self.asked is None:
+            return []
+        known, places = {c.variable for c in self.columns}, columns_of(self.asked)
+        spans, found = np.full(self.starts.shape[1], np.inf), list[str]()
+        spans[np.flatnonzero(self.asked.structure.layout.can_be_set)] = self.spans
+        for start, window in zip(self.starts, windows_of(self.runs, self.window), strict=True):
+            run = self.runs[window.run]
+            for name, rest in at_rest(self.asked, run).items() if not window.first else ():
+                _, variable, component, unit = places[name]
+                place = self.asked.compiled.where[variable].start + component
+                if (
+                    run.whole
+                    and variable not in known
+                    and abs(start[place] - rest) > AWAY * spans[place]
+                ):
+                    found.append(
+                        f"run {window.run} begins at {name} = {start[place]:.3g} {unit}, which was "
+                        f"not measured: if it was at rest, say so, begins='rest'"
+                    )
+        return found
 
     def suggest(
         self,
@@ -507,11 +543,12 @@ class Fit:
         tails = 0.5 * (1.0 - CONFIDENCE)
         ends = np.quantile(found[1:], (tails, 1.0 - tails), axis=0)
         time = recorded.begin + self.measured.control_dt * recorded.instants
-        names = [column.name for column in self.columns]
+        names = [column.name for column in self.measured.recorded]
         about = {"time": np.tile(time, len(names)), "column": np.repeat(names, len(time))}
         kinds = {"measured": recorded.values, "counterfactual": found[0]}
         kinds |= {"low": ends[0], "high": ends[1]}
-        return pd.DataFrame({**about, **{kind: kinds[kind].T.ravel() for kind in kinds}})
+        values = {kind: kinds[kind][:, : len(names)].T.ravel() for kind in kinds}
+        return pd.DataFrame({**about, **values})
 
     @cached_property
     def residuals(self) -> pd.DataFrame:
@@ -550,7 +587,7 @@ class Fit:
             rows.loc[part.index, "time"] += shift
             end = part.time.max() + shift
         worst = sorted(self.misfit, key=self.misfit.__getitem__)[-DRAWN:]
-        names = [column.name for column in self.columns if column.name in worst]
+        names = [c.name for c in self.measured.recorded if c.name in worst]
         figure = blank(9.0, 0.6 + 2.2 * len(names))
         figure.set_layout_engine("constrained")
         axes = figure.subplots(len(names), 2, squeeze=False, sharex=True)

@@ -48,7 +48,7 @@ class Shooting(Simulator):
         world.require_exact("a fit, whose sensitivities are differences of paired runs,")
         self.world, self.runs, self.columns = world, measured.runs, measured.columns
         self.targets, self._open = tuple(targets), ExitStack()
-        self._names = tuple(dict.fromkeys(c.variable for c in self.columns))
+        self._names = tuple(dict.fromkeys(c.variable for c in measured.recorded))
         segments = sum(-(-len(run.instants) // SHORT) for run in self.runs)
         n = min(ROWS, 2 * segments * (2 + len(targets)))
         together = twins_of(world).together(n, self._names, cores())
@@ -63,7 +63,8 @@ class Shooting(Simulator):
         ]
         places = first.compiled.where
         self._places = np.array([places[c.variable].start + c.component for c in self.columns])
-        self.rotations = rotations_of(first, self.columns)
+        self._begins = range(len(measured.recorded), len(self.columns))
+        self.rotations = rotations_of(first, measured.recorded)
         written = {target.variable for target in targets if target.values is not None}
         acting = written.union(*map(first.model.descendants, written))
         follow = [name for name in first.compiled.static_names if name in acting]
@@ -82,14 +83,15 @@ class Shooting(Simulator):
     def guess(self, windows: Sequence[Window]) -> Floats:
         """Guess start states from the measurements, and their spans; see ``Simulator``.
 
-        These are measured numbers and slopes of measured positions; the rest is simulated from the
-        window before, or the default.
+        These are measured numbers and slopes of measured positions, and how a run is known to
+        begin; the rest is simulated from the window before, or the default.
         """
         world = self._batch.world(0)
         begin(world, self.world)
         where, default = world.compiled.slices, world.vector.copy()
         known, moving = [], []  # measured numbers, and velocities of measured positions
-        for i, (_, name, component, _) in enumerate(self.columns):
+        begun = [(self._places[i], i) for i in self._begins]
+        for i, (_, name, component, _) in enumerate(self.columns[: self._begins.start]):
             if name in where:
                 known.append((where[name].start + component, i))
                 stem, _, quantity = name.rpartition(".")
@@ -127,6 +129,8 @@ class Shooting(Simulator):
                     turns = back * turned if frame == "body" else turned * back
                     vector[speed] = np.polyfit(time - time[0], turns.as_rotvec(), 1)[0]
                     mine[speed] = True
+            for place, i in begun if not first and run.whole else ():
+                vector[place], mine[place] = run.values[0, i], True
             for turned_places in self.turned:
                 norm = float(np.linalg.norm(vector[turned_places]))
                 vector[turned_places] /= max(norm, 1e-9)

@@ -39,7 +39,15 @@ from scm_world.world.compiled_task import (
     beginning,
     check_functions,
 )
-from scm_world.world.interventions import Level, Transaction, difference, overlaps, renewed, stacked
+from scm_world.world.interventions import (
+    Level,
+    Transaction,
+    difference,
+    feasible,
+    overlaps,
+    renewed,
+    stacked,
+)
 from scm_world.world.mechanisms import Rows
 from scm_world.world.philox import CompiledNoise
 from scm_world.world.snapshot import Base, Snapshot
@@ -254,7 +262,8 @@ class Simulation(CausalSystem):
             check_functions(self.compiled, self.evaluate())
             self._checked = True
             warn_of_start(self.row, stacklevel=4)
-        self._base, self._base_step = self._step_base(at_start=True), self.index
+        self._base = Base(self.graph, self.row.copy(), self.structure, at_start=True)
+        self._base_step = self.index
 
     def _draw_nature(self) -> None:
         """Draw the random initial values of this episode."""
@@ -262,7 +271,7 @@ class Simulation(CausalSystem):
         compiled = self.structures.natural(key)
         if not compiled.random:
             return
-        row, now = beginning(compiled, key), self._step_base()
+        row, now = beginning(compiled, key), Base(self.graph, self.row, self.structure)
         changed = now.row.differing(row)
         change = difference(now, row, changed)
         if change is not None:
@@ -491,25 +500,26 @@ class Simulation(CausalSystem):
         if not self.has_begun or self._lost:
             self.require_state()
         problems: list[InterventionError] = []
-        flat, before = self.model.named(flatten(request, problems), problems), self._step_base()
+        named = self.compiled.model.named
+        flat = named(flatten(request, problems), problems)
+        before = Base(self.graph, self.row.copy(), self.structure)
         base = self.base or before
         drawn, key = base.drawn, self.noise_key(self.index)
         if any(isinstance(a, Intervention) and (a.is_soft or a.draws) for a in flat.values()):
             initial = base.row.compiled.random if base.at_start else ()
             flat, drawn = renewed(flat, drawn, initial)
-            named = (self.model.named(one.request) for one in levels[:-1])
-            lower = [renewed(one, base.drawn, initial)[0] for one in named]
+            lower = [renewed(named(one.request), base.drawn, initial)[0] for one in levels[:-1]]
             draws = [one.draws for one in levels] or [{}]
             levels = [*map(Level, (*lower, flat), draws)]
         region = self.variables_space if space is None else as_region("space", space)
-        levels = levels or (Level(flat, {}),)
-        done = stacked(self.structures, base, before, levels, region, key, problems)
-        pending = done.kept()
-        audit = self._commit(done, before, flat, check, at_start=base.at_start)
+        solved: Any = partial(stacked if levels else feasible, self.structures, base, before)
+        done: Transaction = solved(levels or flat, region, key, problems)
+        model, pending = done.remains()
+        audit = self._commit(done, model, before, flat, check, at_start=base.at_start)
         rest = (base.structure, pending, drawn, base.at_start)
         self._base = Base(base.model, base.row, *rest)
         self._base_step = self.index - self._offset
-        self.last = done
+        self.last, self.requested = done, request
         return audit
 
     @property
@@ -529,7 +539,7 @@ class Simulation(CausalSystem):
         self.requested = one.request(place)
         if self.index == key.step:
             base, _, self.last = one.done(place)
-            rest = (base.structure, self.last.kept(), one.drawn, base.at_start)
+            rest = (base.structure, self.last.remains()[1], one.drawn, base.at_start)
             self._base = Base(base.model, base.row, *rest)
 
     def _drawn(self, name: str, act: Any) -> dict[str, tuple[str, Any]]:
@@ -544,12 +554,10 @@ class Simulation(CausalSystem):
         parts, key = act.divided(model.declared(name)).items(), replace(key, kept=None)
         return {model.target(n): (n, one.settled(model.declared(n), key)) for n, one in parts}
 
-    def _step_base(self, *, at_start: bool = False) -> Base:
-        return Base(self.graph, self.row.copy(), self.structure, at_start=at_start)
-
     def _commit(
         self,
         done: Transaction,
+        model: SCM,
         before: Base,
         request: Mapping[str, Any],
         check: Callable[[], object] | None,
@@ -581,10 +589,10 @@ class Simulation(CausalSystem):
                     remarks = backend.capabilities.remarks(backend, old)
             clock = done.row.numbers[compiled.clock]
             if change is None and not done.changed and clock == index and self.compiled is compiled:
-                self._adopt_model(done.held())
+                self._adopt_model(model)
                 self.version += 1
             else:
-                self._adopt(done.held(), done.row, done.changed, structure)
+                self._adopt(model, done.row, done.changed, structure)
                 self._offset += self.index - index
                 if at_start:
                     self.row.remember()
@@ -650,11 +658,12 @@ class Simulation(CausalSystem):
         self.substeps = physics_steps(self.options, structure)
 
     def _adopt_model(self, model: SCM) -> None:
-        self.graph, held = model, model.interventions
-        self._held_actions = tuple(name for name in self.compiled.actions if name in held)
-        self.acts_alone = self._translates or bool(self._held_actions)
-        roots = [model._applied(name, held[name]).root for name in self._held_actions]
-        self._inputs = tuple(p.name for of in roots for p in of.intervention.follows(of.requested))
+        acts = {name: model._act_on(name) for name in self.compiled.actions}
+        roots = {name: act.root for name, act in acts.items() if act is not None}
+        self.graph, self._held_actions = model, tuple(roots)
+        self.acts_alone = self._translates or bool(roots)
+        follow = (of.intervention.follows(of.requested) for of in roots.values())
+        self._inputs = tuple(p.name for parents in follow for p in parents)
 
     # --- state ------------------------------------------------------------------------
 
