@@ -286,8 +286,8 @@ def estimate(
     found: Identification,
     table: pandas.DataFrame,
     *,
-    do: bool | float | str,
-    versus: bool | float | str,
+    do: object,
+    versus: object,
     method: str | None = None,
     method_params: Mapping[str, Any] | None = None,
 ) -> Any:
@@ -349,8 +349,9 @@ def estimate(
         data = data.assign(**{treatment: data[treatment] == do})
     else:
         _check_varies(data, treatment, [n for n in others if way != "iv" and n not in labels])
-        counted = data[treatment].astype(float) - float(versus)
-        data = data.assign(**{treatment: counted / (float(do) - float(versus))})
+        high, low = (float(np.asarray(value)) for value in (do, versus))
+        counted = data[treatment].astype(float) - low
+        data = data.assign(**{treatment: counted / (high - low)})
     graph = nx.DiGraph([(treatment, outcome)])  # of the criterion: the table has no other nodes
     if way == "backdoor":
         graph.add_edges_from((name, end) for name in others for end in (treatment, outcome))
