@@ -527,9 +527,8 @@ class Batch:
         self._place[rows] = places
         self._where[rows] = one.where[places]
         self._changes += 1
-        commands = one.compiled.composition.commands
-        if commands is not None:
-            self._acts_alone[rows] = commands.applies(Rows(one.compiled, table.numbers[rows]))
+        commands, now = one.compiled.composition.commands, Rows(one.compiled, table.numbers[rows])
+        self._acts_alone[rows] = commands is not None and commands.applies(now)
         if self._names:
             table.evaluate(self._names, rows)
 
