@@ -527,8 +527,10 @@ class Batch:
         self._place[rows] = places
         self._where[rows] = one.where[places]
         self._changes += 1
-        commands, now = one.compiled.composition.commands, Rows(one.compiled, table.numbers[rows])
-        self._acts_alone[rows] = commands is not None and commands.applies(now)
+        commands = one.compiled.composition.commands
+        self._acts_alone[rows] = commands is not None and commands.applies(
+            Rows(one.compiled, table.numbers[rows])
+        )
         if self._names:
             table.evaluate(self._names, rows)
 
@@ -653,21 +655,14 @@ class Batch:
 
         From then on it takes resets and interventions by itself, which costs more.
         """
-        row = self._numbered(index)
+        row = whole_number("world", index, least=0, most=len(self) - 1)
         self._shown.add(row)
         return self._alone(row)
-
-    def _numbered(self, index: int) -> int:
-        row = whole_number("world", index, least=0)
-        if row >= len(self):
-            allowed = (f"any whole number from 0 to {len(self) - 1}",)
-            raise UnknownOption("world", index, allowed)
-        return row
 
     @typed
     def table(self, index: int) -> Rows:
         """Return the rows of all worlds with the structure of one world."""
-        index = self._numbered(index)
+        index = whole_number("world", index, least=0, most=len(self) - 1)
         return self._by_structure(self._all[index : index + 1])[0][0]
 
     def _by_structure(self, rows: Integers) -> list[tuple[Rows, Integers]]:

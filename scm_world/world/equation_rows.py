@@ -13,7 +13,7 @@ import numpy as np
 
 from scm_world._arguments import one_of, typed, whole_number
 from scm_world._types import ArrayLike, Floats, Integers, Mask, Value
-from scm_world.errors import FunctionFailure, InterventionError, ScmWorldError, UnknownOption
+from scm_world.errors import FunctionFailure, InterventionError, ScmWorldError
 from scm_world.graph import flatten
 from scm_world.graph.scm import request_of
 from scm_world.variables.interventions import has_times
@@ -117,9 +117,7 @@ class EquationBatch:
 
     def world(self, index: int) -> Equations:
         """Return a world by its number, or raise ``UnknownOption``; it is solved alone then."""
-        if whole_number("world", index, least=0) >= len(self):
-            allowed = (f"any whole number from 0 to {len(self) - 1}",)
-            raise UnknownOption("world", index, allowed)
+        index = whole_number("world", index, least=0, most=len(self) - 1)
         at = next(i for i, (_, members) in enumerate(self._parts) if index in members)
         part, members = self._parts.pop(at)
         if part.is_several:
