@@ -19,6 +19,7 @@ from scm_world.fit.problem import (
     SHORT,
     WINDOW,
     LinearWindow,
+    Outlier,
     by_column,
     degrees,
     projected,
@@ -61,6 +62,7 @@ DETERMINED = 0.25  # largest standard error of a determined combination: a share
 MISFIT = 1.5  # least residual that the noise does not explain, in standard deviations of it
 AWAY = 0.5  # of the spread of a state in the recording, at which it is far from rest
 WORSE = 1.1  # times the error of the unfitted world, with which a fit replays worse than it
+SHOWN = 5  # outliers that are named
 MAIN = 0.3  # least share of a parameter in a combination that is named
 DRAWN = 8  # columns of a picture
 
@@ -86,6 +88,8 @@ class Fit:
         ended: Whether the search took all its steps before it found a minimum.
         played: See ``replay``, of the fit and the unfitted world, (2, columns).
         later: The rows that were held out.
+        outliers: Measurements that were left out: no noise of the others leaves them.
+        reading: Another reading of one column that the world follows far better, in words.
 
     Example:
         >>> from scm_world.queries import World
@@ -115,6 +119,8 @@ class Fit:
     ended: bool = False
     played: Floats | None = None
     later: Measurements | None = None
+    outliers: tuple[Outlier, ...] = ()
+    reading: str = ""
 
     @property
     def runs(self) -> tuple[RecordedRun, ...]:
@@ -474,6 +480,18 @@ class Fit:
             f"no experiment of this model seems to determine {name}: it changes {tried}"
             for name in self.unseen
         ]
+        for run, row, column, value, off in sorted(self.outliers, key=lambda o: -abs(o.off))[
+            :SHOWN
+        ]:
+            time = self.runs[run].begin + self.measured.control_dt * self.runs[run].instants[row]
+            where = f"row {row}" + f" of run {run}" * (len(self.runs) > 1) + f" ({time:.4g} s)"
+            found.append(
+                f"{self.columns[column].name} = {value:.4g} in {where} is {off:.3g} from "
+                f"the fit, {abs(off) / self.noise[column]:.3g} times the noise: it was left out"
+            )
+        if len(self.outliers) > SHOWN:
+            found.append(f"{len(self.outliers)} measurements were left out; fit.outliers has all")
+        found += [self.reading] * bool(self.reading)
         groups = [tuple(n for n in names if n not in self.unseen) for names in self.confounded]
         if self.worse:
             found.append(
