@@ -27,7 +27,15 @@ from scm_world.fit.problem import (
     spread_of,
     windows_of,
 )
-from scm_world.fit.recordings import Begins, Measurements, Noise, Recording, begun, read_recording
+from scm_world.fit.recordings import (
+    Begins,
+    Measurements,
+    Noise,
+    Reading,
+    Recording,
+    begun,
+    read_recording,
+)
 from scm_world.fit.result import DETERMINED, Fit
 from scm_world.fit.search import SAME, SEARCHES, Minima, Result, gauss_newton
 from scm_world.fit.shooting import Shooting
@@ -59,13 +67,15 @@ def fit(
     begins: Begins = None,
     held_out: float | None = None,
     setups: Sequence[Mapping[str, object]] | None = None,
+    columns: Mapping[str, str] | None = None,
+    ignore: Iterable[str] = (),
     symmetric: bool = False,
     progress: Progress | None = None,
     search: Search = gauss_newton,
 ) -> Fit:
     """Fit parameters to a recording with any search; see ``World.fit`` and ``Search``."""
     world = world.for_fit(recording)
-    how = window, begins, setups, symmetric
+    how = window, begins, Reading(setups, columns, ignore), symmetric
     measured, targets = arguments_of(world, recording, as_names(parameters), *how)
     measured, later = (measured, None) if held_out is None else parted(measured, held_out)
     count, number = len(measured.cells[0]), len(targets)
@@ -107,7 +117,7 @@ def arguments_of(
     parameters: Iterable[str] | None,
     window: int | None,
     begins: Begins = None,
-    setups: Sequence[Mapping[str, object]] | None = None,
+    reading: Reading | None = None,
     symmetric: bool = False,
 ) -> tuple[Measurements, tuple[Target, ...]]:
     """Check and read the arguments of a fit; all parameters that act on a measurement if None."""
@@ -120,7 +130,7 @@ def arguments_of(
         problem = f"the world is given {late} at a time, and a recording may begin at any"
         raise ModelError([f"{problem}: give values without a time"])
     with twin_of(world) as twin:
-        measured = read_recording(twin, recording, setups)
+        measured = read_recording(twin, recording, reading)
         asked = acting(twin, measured.columns) if parameters is None else parameters
         targets = targets_of(twin, asked, symmetric=symmetric)
         check_units(world, measured)

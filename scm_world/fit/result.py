@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, final
@@ -31,6 +31,7 @@ from scm_world.fit.recordings import (
     Limits,
     MeasuredNumber,
     Measurements,
+    Reading,
     RecordedRun,
     at_rest,
     columns_of,
@@ -422,7 +423,14 @@ class Fit:
         return unfitted < min(1.0, fit / WORSE)
 
     @typed
-    def predict(self, recording: object, *, ahead: float | None = None) -> Prediction:
+    def predict(
+        self,
+        recording: object,
+        *,
+        ahead: float | None = None,
+        columns: Mapping[str, str] | None = None,
+        ignore: Iterable[str] = (),
+    ) -> Prediction:
         """Predict another recording, beside the world that was asked and a constant.
 
         It is cut into windows that do not overlap. The fitted and the unfitted world each begin
@@ -431,13 +439,16 @@ class Fit:
         Args:
             recording: The recording, of the kinds of ``World.fit``.
             ahead: How far to predict [s]; 40 rows if None, or as a window of the fit.
+            columns: See ``World.fit``.
+            ignore: See ``World.fit``.
 
         Raises:
             UnknownOption: No window has a row to predict.
             ModelError: The recording has faults.
         """
         with twin_of(self.asked) as twin:
-            return predicted(self, read_recording(twin, recording), ahead)
+            how = Reading(None, columns, ignore)
+            return predicted(self, read_recording(twin, recording, how), ahead)
 
     @cached_property
     def held_out(self) -> Prediction | None:
