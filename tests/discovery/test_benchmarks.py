@@ -120,8 +120,10 @@ REFERENCES: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("name", REFERENCES)
-def test_scores_are_those_of_the_reference(name: str) -> None:
+def test_scores_are_those_of_the_reference(name: str, request: pytest.FixtureRequest) -> None:
     """The same seeds give the scores of ``benchmark_reference.csv``, to twelve digits."""
+    if name != "models":  # which is done in another process
+        request.getfixturevalue("in_this_process")
     with (Path(__file__).parent / "benchmark_reference.csv").open() as stream:
         lines = [line for line in csv.DictReader(stream) if line.pop("benchmark") == name]
     result = benchmark(**REFERENCES[name])
@@ -137,6 +139,7 @@ def test_scores_are_those_of_the_reference(name: str) -> None:
                 assert value == expected, (key, line)
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_models_are_problems(tmp_path: Path) -> None:
     """An object stands beside names; two of them are told apart, and results are read again."""
     models = [random_model("er2:4", seed) for seed in (1, 2)]
@@ -205,6 +208,7 @@ def test_files_that_models_name_are_copied(tmp_path: Path) -> None:
     assert done.stdout == "(3.0,)\n", done.stderr
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_a_budget_is_not_exceeded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where an episode has several rows, the last one is cut; without a folder nothing is kept."""
     monkeypatch.chdir(tmp_path)
@@ -214,6 +218,7 @@ def test_a_budget_is_not_exceeded(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert list(table.experiments) == list(table.budget) == [15, 36]
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_the_order_of_declaration_is_no_hint() -> None:
     """Of a model declared in causal order, each seed permutes the columns, for every learner."""
     line = [Derived(name="a", parents=(), mechanism=Linear(weights=()), noise=Normal())]
@@ -264,6 +269,7 @@ def test_workers_change_nothing_but_seconds(
     assert {total for _, total in told} == {10}
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_a_benchmark_resumes(done: tuple[BenchmarkResult, Path]) -> None:
     """Deleted runs are run again and give the same; the others are not touched."""
     result, folder = done
@@ -329,6 +335,7 @@ def test_a_folder_of_something_else_is_untouched(tmp_path: Path) -> None:
         benchmark(**SMALL, out=tmp_path)
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_a_changed_model_or_library_is_another_benchmark(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -583,6 +590,7 @@ BALLS = """
 """
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_a_world_with_contacts_is_scored_in_each_context(tmp_path: Path) -> None:
     """Free of contacts, a learner is no worse than a trivial answer; the folder has all of it."""
     (tmp_path / "balls.xml").write_text(BALLS)
