@@ -475,8 +475,9 @@ class Batch:
         for one, members, table in ready:
             places = np.setdiff1d(np.arange(len(members)), one.refused)
             which, numbers = members[places], one.numbers[places]
-            moved = which[changes(one.compiled, table.numbers[which], numbers)[1]]
-            table.numbers[which] = numbers
+            differ = changes(one.compiled, table.numbers[which], numbers)[1]
+            moved = which[differ]
+            table.numbers[moved] = numbers[differ]
             table.numbers[moved, one.compiled.fresh] = 0.0
             if one.at_start and len(moved):
                 table.remember(moved)

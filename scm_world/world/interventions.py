@@ -357,6 +357,7 @@ class Transaction:
 
     def solve_rows(
         self,
+        bases: Rows,
         now: Rows,
         where: NDArray[np.uint64],
         key: Callable[[int], NoiseKey],
@@ -365,7 +366,8 @@ class Transaction:
         """Solve for worlds that differ in their numbers and their noise only.
 
         Args:
-            now: Their rows, which are the base and the present of each.
+            bases: Their rows as physics left them.
+            now: Their present rows.
             where: The key of the seed, the episode and the control step of each, shape (m, 3).
             key: Returns the noise key of one of them.
             own: What each has of its own, by target: values, shape (m, *shape), or interventions,
@@ -375,7 +377,7 @@ class Transaction:
             The rows afterwards, shape (m, width), and the places of those that refuse it, or have
             to draw again.
         """
-        numbers, acts = now.numbers.copy(), dict(self.acts)
+        numbers, acts = bases.numbers.copy(), dict(self.acts)
         drawn, groups = self._boxes
         found = Rows(self.compiled, numbers)
         constants: dict[str, Any] = {t: a.constant for t, (name, a) in acts.items() if name == t}
@@ -401,7 +403,8 @@ class Transaction:
                 self.acts[target] = target, act
                 if target in self.pending:
                     self.pending[target] = target, act
-            self.base = before = replace(self.base, row=now.row(place))
+            self.base = replace(self.base, row=bases.row(place))
+            before = replace(self.base, row=now.row(place))
             try:
                 wrong: Any = self.solve(key(place), before) or self.obstacles(before, draws)
             except ScmWorldError:

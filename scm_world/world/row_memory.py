@@ -107,8 +107,8 @@ class RowMemory:
         """Compute an intervention; return False if each world has to compute it alone.
 
         These are: what changes which bodies exist or what the engine compiles, sets the clock, or
-        is on an action; a second intervention at an instant at which something was moved; an
-        intervention that acts on another one; and what is wrong in all of them.
+        is on an action; an intervention that acts on another one; a value in other coordinates;
+        and what is wrong in all of them.
 
         Args:
             request: The interventions by name.
@@ -117,8 +117,7 @@ class RowMemory:
         """
         compiled, model, declared = self.compiled, self.compiled.model, self.compiled.model.declared
         by_hand, deciding = compiled.set_by_hand, self.structures.deciding
-        unknown = any(n not in model or n in deciding for n in request)
-        if unknown or any(map(compiled.moves_bodies, self._pending)):
+        if any(name not in model or name in deciding for name in request):
             return False
         first = {n: values[n][0] if n in values else act for n, act in request.items()}
         own: dict[str, Any] = {}
@@ -131,8 +130,7 @@ class RowMemory:
             return False
         initial = compiled.random if self.at_start else ()
         first, self.drawn = renewed(first, self._drawn, initial)
-        row = Rows(compiled, self._before[0])
-        base = Base(self.graph(0), row, self.structure, at_start=self.at_start)
+        base = self._base_of(0)
         done = Transaction(self.structures, base, first, space, self.key(0))
         for name in done.relative:
             act: Any = model.accept(name, first[name])
@@ -142,23 +140,26 @@ class RowMemory:
         if (
             done.problems
             or not {CONTROL_INDEX, *compiled.actions}.isdisjoint(done.pending)
-            or any(act.lower is not None for _, act in done.pending.values())
+            or any(act.lower is not None for act in accepted.values())
             or any(accepted[name].constant is not None for name in others)
             or any(model.targets(name) != (name,) for name in own)
             or not compiled.composition.structural.isdisjoint(done.order)
         ):
             return False
-        differing = {t: one for t, (_, one) in self.in_force.items() if isinstance(one, np.ndarray)}
-        follow = {t: one for t, one in differing.items() if t in done.order}
-        kept = {**{t: one for t, one in follow.items() if t not in done.pending}, **own}
-        now = Rows(compiled, self._before)
-        found, self.refused = done.solve_rows(now, self.where, self.key, kept)
+        targets = {target for name in done.asked for target in model.targets(name)}
+        kept = {t: one for t, (_, one) in self.in_force.items() if isinstance(one, np.ndarray)}
+        there = {*done.order, *done.pending}.difference(targets)
+        kept = {t: one for t, one in kept.items() if t in there} | own
+        rows = Rows(compiled, self._base), Rows(compiled, self._before)
+        found, self.refused = done.solve_rows(*rows, self.where, self.key, kept)
         self.numbers, self.asked = found, done.asked
         self._request, self._values, self._space = request, values, space
         self._acts = {name: act for name, act in first.items() if name not in values}
         anew: Named = {}
         for target, (name, act) in done.pending.items():
-            if target in own:
+            if target not in targets:
+                anew[target] = self._earlier[target]
+            elif target in own:
                 anew[target] = target, own[target]
             elif act.draws or (target in by_hand and act.constant is None and not act.releases):
                 drawn = found[:, compiled.where[target]]
@@ -200,12 +201,14 @@ class RowMemory:
         held = dict(_of_one(one, place) for t, one in acts.items() if t not in by_hand)
         return self.model._with_interventions(held) if held else self.model
 
+    def _base_of(self, place: int) -> Base:
+        model, row = self._model(self._held, place), Rows(self.compiled, self._base[place].copy())
+        pending = {t: _of_one(self._earlier[t], place) for t in self._waiting}
+        return Base(model, row, self.structure, pending, self._drawn, self.at_start)
+
     def done(self, place: int) -> tuple[Base, Base, Transaction]:
         """Return the base and the present of one world before, and what it would do alone."""
-        pending = {t: _of_one(self._earlier[t], place) for t in self._waiting}
-        row, now = (Rows(self.compiled, one[place].copy()) for one in (self._base, self._before))
-        model = self._model(self._held, place)
-        base = Base(model, row, self.structure, pending, self._drawn, self.at_start)
+        base, now = self._base_of(place), Rows(self.compiled, self._before[place].copy())
         before = Base(self._model(self._earlier, place), now, self.structure)
         asked = {n: self._acts.get(n, act) for n, act in self.request(place).items()}
         levels, key = [Level(asked, {})], self.key(place)
