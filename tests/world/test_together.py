@@ -237,14 +237,14 @@ def test_histories_of_any_kind_are_those_of_single_worlds(backend: str, seed: in
                 world.reset(seed=seed + turn + row)
         mask = rng.random(N) < 0.7
         mask[rng.integers(N)] = True
-        if rng.random() < 0.3:
+        if turn % 10 and rng.random() < 0.3:
             action = rng.uniform(-1.0, 1.0, (N, 9))
             worlds.step(action, where=mask)
             for row in np.flatnonzero(mask):
                 alone[row].step(action[row])
             continue
-        request = MOVES[rng.integers(len(MOVES))]
-        if rng.random() < 0.3:
+        request = MOVES[rng.integers(len(MOVES)) if turn % 10 else turn // 10]
+        if turn % 10 and rng.random() < 0.3:
             request = random_request(alone[int(np.argmax(mask))], rng)
         audits = worlds.do(request, where=mask, on_refusal="skip")
         done = [worlds._done[row] for row in np.flatnonzero(mask)]
