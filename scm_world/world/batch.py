@@ -374,7 +374,7 @@ class Batch:
         """Change worlds that begin to what is drawn in them; see ``Simulation._draw_nature``."""
         compiled, size = one.compiled, one.compiled.state_size
         for places, changed, moved in changes(compiled, numbers, then)[0]:
-            parameters = _parameters(compiled, then[places], changed)
+            parameters = _parameters(Rows(compiled, then), changed, places)
             if parameters or moved:
                 states = then[places, :size] if moved else None
                 self._engine.apply(rows[places], parameters, states)
@@ -474,10 +474,9 @@ class Batch:
             raise
         for one, members, table in ready:
             places = np.setdiff1d(np.arange(len(members)), one.refused)
-            which, numbers = members[places], one.numbers[places]
-            differ = changes(one.compiled, table.numbers[which], numbers)[1]
-            moved = which[differ]
-            table.numbers[moved] = numbers[differ]
+            which, differ = members[places], places[one.differs[places]]
+            moved = members[differ]
+            table.numbers[moved] = one.numbers[differ]
             table.numbers[moved, one.compiled.fresh] = 0.0
             if one.at_start and len(moved):
                 table.remember(moved)
@@ -530,33 +529,34 @@ class Batch:
         compiled, size = one.compiled, one.compiled.state_size
         keys, known, targets = compiled.parameter_keys, compiled.inertias, compiled.model.targets
         wanted = {keys[t] for name in one.asked for t in targets(name) if t in keys}
-        taken = np.setdiff1d(np.arange(len(members)), one.refused)
-        now = table.numbers[members]
+        old, new = Rows(compiled, table.numbers[members]), Rows(compiled, one.numbers)
         layout = compiled.composition.system.layout
         settable, kept = layout.can_be_set, layout.can_be_set & ~layout.engine_takes
         remarked = self._first.backend.capabilities.remarks
         audits: list[tuple[Integers, Callable[[int], Audit]]] = []
         is_moved = False
-        for group, changed, moved in changes(compiled, now[taken], one.numbers[taken])[0]:
-            places = taken[group]  # nearly always all of them
-            which, old, new = members[places], now[places], one.numbers[places]
-            before, then = (_parameters(compiled, each, changed) for each in (old, new))
+        for group, changed, moved in one.groups:
+            places = np.setdiff1d(group, one.refused) if one.refused else group
+            if not len(places):
+                continue
+            which = members[places]
+            before, then = (_parameters(each, changed, places) for each in (old, new))
+            left, states = (each.numbers[places, :size] if moved else None for each in (old, new))
             inertia = self._engine.parameters(which, sorted({known[k] for k in then if k in known}))
             others = np.ones(len(which), bool)
             try:
                 if then or moved:
-                    self._engine.apply(which, then, new[:, :size] if moved else None)
+                    self._engine.apply(which, then, states)
             except ScmWorldError as error:
                 others = ~np.isin(which, error.scenes)
                 raise located(error, error.scenes[0], "world") from error.__cause__
             finally:  # these have changed
                 values = {key: value[others] for key, value in before.items()}
-                states = old[others, :size] if moved else None
-                back.append(partial(self._engine.apply, which[others], values, states))
+                earlier = None if left is None else left[others]
+                back.append(partial(self._engine.apply, which[others], values, earlier))
             reported = self._engine.parameters(which, {*wanted, *then, *inertia})
             found = {".".join(key): (value, reported[key]) for key, value in then.items()}
-            if moved:
-                states = new[:, :size]
+            if states is not None:
                 read = np.where(kept, states, self._engine.read(which))
                 found["the state"] = states[:, settable], read[:, settable]
                 one.numbers[places, :size], is_moved = read, True
@@ -822,9 +822,9 @@ def _copied(kind: type[Batch], saved: Mapping[int, Snapshot], *given: Any) -> Ba
     return made
 
 
-def _parameters(compiled: CompiledTask, rows: Floats, names: Iterable[str]) -> dict[Any, Value]:
-    keys, values = compiled.parameter_keys, Rows(compiled, rows)
-    return {keys[name]: values[name] for name in names if name in keys}
+def _parameters(rows: Rows, names: Iterable[str], places: Integers) -> dict[Any, Value]:
+    keys = rows.compiled.parameter_keys
+    return {keys[name]: rows[name][places] for name in names if name in keys}
 
 
 # --- arguments of many worlds ---------------------------------------------------------------------

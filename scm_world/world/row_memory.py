@@ -27,6 +27,10 @@ Named = dict[str, tuple[str, Any]]
 """By target: the requested name, and an intervention; or the values (m, *shape) or interventions
 (m,) of m worlds."""
 
+Change = tuple[Integers, list[str], bool]
+"""Places of rows that change alike, the static variables that do, and whether the engine's state
+does."""
+
 
 @final
 class RowMemory:
@@ -49,6 +53,8 @@ class RowMemory:
 
     Attributes:
         numbers: The rows after the intervention, shape (m, width).
+        groups: The places of the worlds by what changes in them; see ``changes``.
+        differs: Whether anything changes in each world, shape (m,).
         states: The states as the engine reported them, if it was given any, shape (m, size).
         refused: The places of the worlds that have to compute it alone, or refuse it.
         asked: The requested names.
@@ -65,6 +71,8 @@ class RowMemory:
     states: Floats | None = None
     drawn: Mapping[str, int]
     numbers: Floats
+    groups: list[Change]
+    differs: Mask
 
     def __init__(
         self,
@@ -153,6 +161,7 @@ class RowMemory:
         rows = Rows(compiled, self._base), Rows(compiled, self._before)
         found, self.refused = done.solve_rows(*rows, self.where, self.key, kept)
         self.numbers, self.asked = found, done.asked
+        self.groups, self.differs = changes(compiled, self._before, found)
         self._request, self._values, self._space = request, values, space
         self._acts = {name: act for name, act in first.items() if name not in values}
         anew: Named = {}
@@ -260,11 +269,6 @@ def _of_one(named: tuple[str, Any], place: int) -> tuple[str, Intervention]:
     return name, own if isinstance(own, Intervention) else Hard.of(np.asarray(own))
 
 
-Change = tuple[Integers, list[str], bool]
-"""Places of rows that change alike, the static variables that do, and whether the engine's state
-does."""
-
-
 def changes(compiled: CompiledTask, now: Floats, then: Floats) -> tuple[list[Change], Mask]:
     """Return how rows differ, in groups that differ in the same variables.
 
@@ -277,13 +281,15 @@ def changes(compiled: CompiledTask, now: Floats, then: Floats) -> tuple[list[Cha
         The groups, together all rows; and whether each row differs in parameters or states.
     """
     differ, layout = now != then, compiled.composition.system.layout
-    owners = compiled.owners[differ.any(axis=0)]
-    names = [compiled.static_names[number] for number in np.unique(owners[owners >= 0])]
+    owners = {*compiled.owners[differ.any(axis=0)].tolist()}
+    names = [compiled.static_names[number] for number in sorted(owners) if number >= 0]
     parts = [differ[:, compiled.where[name]].any(axis=1) for name in names]
     moves = differ[:, : compiled.state_size] & layout.can_be_set
     taken = (moves & layout.engine_takes).any(axis=1)
     patterns: NDArray[np.bool_] = np.array([*parts, taken]).T
-    kinds, of = np.unique(patterns, axis=0, return_inverse=True)
+    kinds, of = patterns[:1], np.zeros(len(now), dtype=int)  # nearly always alike
+    if (patterns != kinds).any():
+        kinds, of = np.unique(patterns, axis=0, return_inverse=True)
     groups = [
         (
             np.flatnonzero(of.ravel() == number),
