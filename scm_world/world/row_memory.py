@@ -80,8 +80,8 @@ class RowMemory:
         structure: Structure,
         compiled: CompiledTask,
         now: Floats,
-        where: Any,
-        seeds: Any,
+        where: NDArray[np.uint64],
+        seeds: Sequence[int],
         below: tuple[RowMemory, Integers] | None = None,
     ) -> None:
         self.structures, self.structure, self.compiled = structures, structure, compiled

@@ -27,7 +27,7 @@ from scm_world.graph import SCM, NoiseKey, flatten
 from scm_world.models import Difference, Parameters, Scene, Structure
 from scm_world.models.camera import Camera
 from scm_world.tasks import AnySource, Options, Task, make_task
-from scm_world.tasks.composition import Composition
+from scm_world.tasks.composition import Composition, Held, parts
 from scm_world.tasks.model import REWARD
 from scm_world.tasks.rewards import FRACTION, SUCCESS
 from scm_world.variables import Draw, Hard, Intervention, Subset
@@ -51,7 +51,7 @@ from scm_world.world.interventions import (
 from scm_world.world.mechanisms import Rows
 from scm_world.world.philox import CompiledNoise
 from scm_world.world.snapshot import Base, Snapshot
-from scm_world.world.structures import StructureCache
+from scm_world.world.structures import StructureCache, structures_of
 from scm_world.world.system import CausalSystem
 
 if TYPE_CHECKING:
@@ -159,7 +159,7 @@ class Simulation(CausalSystem):
         if shared is not None and replace(shared.options, steps=0) != options:
             name, allowed = "options of a world with these structures", (str(shared.options),)
             raise UnknownOption(name, options, allowed)
-        self.structures = shared or StructureCache(kind, options)
+        self.structures = shared or structures_of(kind, options)
         self.deciding, self.policies = self.structures.deciding, kind.policies
         self.options = self.structures.options
         self._checked = False
@@ -422,12 +422,20 @@ class Simulation(CausalSystem):
         if self.acts_alone:
             command, sent, held = self._decided(command)
         row.prepare()
+        done = 0
         try:
-            self.backend.step(sent, self.substeps)
+            if sent.ndim == 1:
+                self.backend.step(sent, self.substeps)
+            for steps, part in parts(sent, held.samples if held else ()) if sent.ndim > 1 else ():
+                self.backend.step(part, steps)
+                done += steps
+                if held is not None and done in held.samples:
+                    self.backend.read(self.state)
+                    held.see(done, self.state.vector)
         except EngineFailure as error:
             left, vector = self.compiled.empty_state(), self.state.vector
             self.backend.read(left)
-            if not error.lost and np.isfinite(left.vector).all():  # the step was not taken
+            if not (done or error.lost) and np.isfinite(left.vector).all():  # no step was taken
                 raise
             text = str(error)
             if vector.size:
@@ -442,14 +450,15 @@ class Simulation(CausalSystem):
         row.advance(command)
         self.backend.read(self.state)
         if held is not None:
-            self.state.vector[-held.size :] = held
+            self.state.vector[-held.numbers.size :] = held.numbers
 
-    def _decided(self, action: Floats) -> tuple[Floats, Floats, Floats | None]:
+    def _decided(self, action: Floats) -> tuple[Floats, Floats, Held | None]:
         """Compute what a control step does with an action, if the world ``acts_alone``.
 
         Returns:
             The action after interventions on actions; the backend's command, valid until the next
-            call; and the states that are kept here as they are after the step, None without any.
+            call, see ``Commands.command``; and the states that are kept here as they are after the
+            step, None without any.
         """
         held, key = self._held_actions, self.noise_key(self.index)
         if held:
@@ -462,7 +471,7 @@ class Simulation(CausalSystem):
         if not self._translates:
             return action, action, None
         commands: Any = self.composition.commands
-        given = action, self.row, self.state.vector, key
+        given = action, self.row, self.state.vector, key, self.substeps
         return action, commands.command(*given), commands.held(*given)
 
     # --- interventions ------------------------------------------------------------------------
