@@ -9,7 +9,7 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._types import Floats, Integers, Mask, Value
-from scm_world.errors import blamed
+from scm_world.errors import ScmWorldError, blamed
 from scm_world.policies.scripted import OpenLoopPolicy, as_policy
 from scm_world.queries.episodes import ALL, Episode, Era, Unit, run, who
 from scm_world.variables.distributions import word_of
@@ -149,10 +149,11 @@ class _Together:
     def _asked_of_all(self, units: Sequence[Unit]) -> list[dict[int, dict[str, Any]] | None]:
         """Return what each unit asks for, by instant; None of one with a world of its own."""
         first, policy, can = self._batch.first, units[0].policy, False
-        with suppress(Exception):  # in a world of its own, each unit says what is wrong
+        with suppress(ScmWorldError):  # in a world of its own, each unit says what is wrong
             known: Any = as_policy(policy, first)
-            known.together(first, np.zeros((1, 2), dtype=np.uint64), 0, 1)
-            can = self._batch.begins_alike()
+            if hasattr(known, "together") and self._batch.begins_alike():
+                known.together(first, np.zeros((1, 2), dtype=np.uint64), 0, 1)
+                can = True
         plans = {id(unit.plan): unit.plan for unit in units if can}
         asked = {key: plan._asked_of_all(first, self._steps) for key, plan in plans.items()}
         return [
