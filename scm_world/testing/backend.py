@@ -203,6 +203,17 @@ class BackendConformance(ABC):
             assert np.array_equal(play(backend, commands, self.substeps), alone)
         assert np.array_equal(elsewhere(played, kind, scene, commands, self.substeps), alone)
 
+    def test_a_command_can_be_held_in_parts(self, backend: Backend) -> None:
+        """Commands that arrive within a control step divide it; the others do not notice."""
+        if not backend.capabilities.physics:
+            pytest.skip("nothing moves by itself")
+        start, commands = backend.snapshot(), self.commands(backend.structure, 10)
+        whole = play(backend, commands, self.substeps)
+        backend.restore(start)
+        parts = play(backend, np.repeat(commands, self.substeps, axis=0), 1)
+        floor = backend.capabilities.floor
+        assert np.allclose(parts[self.substeps - 1 :: self.substeps], whole, rtol=0.0, atol=floor)
+
     def test_contacts_are_those_of_the_last_step(self, scene: Scene) -> None:
         """Nothing touches before the first step; a change of the state does not change them."""
         with self.built(scene) as backend:

@@ -6,6 +6,7 @@ import secrets
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from inspect import signature
+from types import MappingProxyType
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -24,6 +25,7 @@ from scm_world.errors import (
 from scm_world.graph import SCM, flatten
 from scm_world.graph.scm import request_of
 from scm_world.runs.processes import cores
+from scm_world.tasks.composition import Held, parts
 from scm_world.variables import Hard
 from scm_world.variables.distributions import word_of
 from scm_world.variables.interventions import has_times
@@ -694,10 +696,19 @@ class Batch:
         """Return the rows of some worlds by structure, with the numbers of these worlds."""
         return [(self._tables[kind[0]], members) for kind, members in self._groups(rows)]
 
-    def advance(self, commands: Floats, which: Mask | None = None) -> None:
-        """Advance worlds one control step, all if ``which`` is None; see ``Simulation.advance``.
+    def advance(
+        self,
+        commands: Floats,
+        which: Mask | None = None,
+        within: Mapping[int, Floats] = MappingProxyType({}),
+    ) -> None:
+        """Advance worlds one control step; see ``Simulation.advance``.
 
-        Commands are finite numbers within the bounds, shape (n, n_actions).
+        Args:
+            commands: Finite numbers within the bounds, shape (n, n_actions).
+            which: The worlds; all if None.
+            within: By number of a world, what acts in each physics step in place of its command,
+                shape (substeps, n_actions).
 
         Raises:
             NotReset: No episode has begun in one of the worlds.
@@ -708,20 +719,14 @@ class Batch:
         rows = self._all if which is None else np.flatnonzero(which)
         self._require_states(rows)
         groups, sent = self._groups(rows), commands
-        held: dict[int, Floats] = {}
+        held: dict[int, Held] = {}
+        late: Mapping[int, Floats] = within
         there: Any = self._worlds
         alone = [row for row in self._existing(rows) if there[row].acts_alone]
         alone += rows[self._acts_alone[rows]].tolist()
         if alone:
-            commands = commands.copy()
-            sent = np.zeros((len(self), self._first.structure.n_commands))
             others = np.setdiff1d(rows, alone)
-            if others.size:  # none, and a row of commands may be of another size
-                sent[others] = commands[others]
-            for row in alone:
-                commands[row], sent[row], numbers = self._decided(row, commands[row])
-                if numbers is not None:
-                    held[row] = numbers
+            commands, sent, late, held = self._decide(alone, others, commands, within)
         failed: EngineFailure | None = None
         for (compiled, substeps), members in groups:
             table = self._tables[compiled]
@@ -729,7 +734,7 @@ class Batch:
             kept = table.numbers[members if self._engine.may_refuse else members[:0]]
             table.advance(commands, members)
             try:
-                self._engine.step(members, sent, substeps, table.numbers)
+                self._step(members, sent, late, held, substeps, table.numbers)
             except BaseException as error:  # or Ctrl-C: the others were stepped
                 unmoved = error.unmoved if isinstance(error, EngineFailure) else ()
                 for place, row in enumerate(members.tolist()):
@@ -746,14 +751,67 @@ class Batch:
             finally:
                 for row in members.tolist() if held else ():
                     if row in held:
-                        there = slice(compiled.state_size - held[row].size, compiled.state_size)
-                        table.numbers[row, there] = held[row]
+                        numbers, size = held[row].numbers, compiled.state_size
+                        table.numbers[row, size - numbers.size : size] = numbers
         if failed is not None:
             raise failed
         for (compiled, _), members in groups:
             self._tables[compiled].evaluate(self.names, members)
 
-    def _decided(self, row: int, action: Floats) -> tuple[Floats, Floats, Floats | None]:
+    def _decide(
+        self, alone: list[int], others: Integers, commands: Floats, within: Mapping[int, Floats]
+    ) -> tuple[Floats, Floats, dict[int, Floats], dict[int, Held]]:
+        """Return actions, commands, those of each physics step, and what worlds keep; see above."""
+        commands, late, held = commands.copy(), dict(within), dict[int, Held]()
+        sent = np.zeros((len(self), self._first.structure.n_commands))
+        if others.size:  # none, and a row of commands may be of another size
+            sent[others] = commands[others]
+        for row in alone:
+            if row in within:
+                now = [self._decided(row, one)[1].copy() for one in within[row]]
+                late[row] = np.array([c if c.ndim == 1 else c[i] for i, c in enumerate(now)])
+            commands[row], found, after = self._decided(row, commands[row])
+            if found.ndim > 1:
+                late.setdefault(row, found.copy())
+            sent[row] = found if found.ndim == 1 else found[-1]
+            if after is not None:
+                held[row] = after
+        return commands, sent, late, held
+
+    def _step(
+        self,
+        members: Integers,
+        sent: Floats,
+        late: Mapping[int, Floats],
+        held: Mapping[int, Held],
+        substeps: int,
+        into: Floats,
+    ) -> None:
+        """Step the engine, part by part where commands change within the control step."""
+        mine = [row for row in members.tolist() if row in late] if late else []
+        if not mine:
+            self._engine.step(members, sent, substeps, into)
+            return
+        each = np.repeat(sent[None], substeps, axis=0)
+        each[:, mine] = np.stack([late[row] for row in mine], axis=1)
+        going, done, failed = members, 0, None
+        samples = {step for row in mine if row in held for step in held[row].samples}
+        for steps, part in parts(each, samples):
+            try:
+                self._engine.step(going, part, steps, into)
+            except EngineFailure as error:
+                if done:  # the control step was taken in part
+                    error.lost, error.unmoved = (*error.lost, *error.unmoved), ()
+                going = np.setdiff1d(going, (*error.lost, *error.unmoved))
+                failed = error.after(failed)
+            done += steps
+            for row in going.tolist() if done in samples else ():
+                if row in held:
+                    held[row].see(done, into[row])
+        if failed is not None:
+            raise failed
+
+    def _decided(self, row: int, action: Floats) -> tuple[Floats, Floats, Held | None]:
         """Compute what a control step does with an action; see ``Simulation._decided``."""
         world, done = self._worlds[row], self._done[row]
         if world is not None or done is None:
@@ -762,7 +820,7 @@ class Batch:
         key.step = int(own.numbers[done.compiled.clock])
         state = own.numbers[: done.compiled.state_size]
         commands: Any = done.compiled.composition.commands
-        given = action, own, state, key
+        given = action, own, state, key, self._kinds[self._kind[row]][1]
         return action, commands.command(*given), commands.held(*given)
 
     def _require_states(self, rows: Integers) -> None:

@@ -368,6 +368,12 @@ class CompiledTask(Vectors):
         return self.task.plan, self.task.absent
 
     @cached_property
+    def bounded(self) -> frozenset[str]:
+        """The variables whose bounds follow others."""
+        declared = self.model.variables
+        return frozenset(v.name for v in declared if v.bounds is not None and v.bounds.parents())
+
+    @cached_property
     def readouts(self) -> tuple[str, ...]:
         """The variables that are computed from measurements, without bundles."""
         measured = (v for v in self.model.variables if v.is_measured and v.equation is not None)

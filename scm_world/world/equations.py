@@ -386,6 +386,7 @@ class Equations(CausalSystem):
         except BaseException:
             self.restore(before)
             raise
+        self.requested = request
         return self._audit(flat, earlier, now, waiting)
 
     def _audit(
