@@ -25,6 +25,7 @@ from scm_world.errors import (
 from scm_world.graph import SCM, flatten
 from scm_world.graph.scm import request_of
 from scm_world.runs.processes import cores
+from scm_world.tasks import AnySource
 from scm_world.tasks.composition import Held, parts
 from scm_world.variables import Hard
 from scm_world.variables.distributions import word_of
@@ -115,15 +116,15 @@ class Batch:
         self._acts_alone = np.zeros(n, bool)
         self._origin: Snapshot | None = None  # before anything is drawn
         self._changes, self._is_closed = 0, False
-        self._options: Any = None  # of worlds that do not exist yet
-        self._make: Any = None  # makes an empty backend for one
+        self._options: Mapping[str, Any] | None = None  # of worlds that do not exist yet
+        self._make = partial(make_backend, first.backend.name)  # an empty backend for one
 
     @classmethod
     def _of(
         cls,
         kind: type[Simulation],
         num_worlds: int,
-        task: Any = "pushing",
+        task: AnySource = "pushing",
         *,
         threads: int | None = None,
         **options: Any,
@@ -153,7 +154,6 @@ class Batch:
         made = cls.__new__(cls)
         made._set_up(first, [None] * n, n, threads, names)
         made._options = {n: value for n, value in options.items() if n not in ("backend", "device")}
-        made._make = partial(make_backend, first.backend.name)
         made._engine = first.backend.batch.made_by(made._make, n, made.threads)
         return made
 
@@ -162,7 +162,7 @@ class Batch:
         world = self._worlds[row]
         if world is None:
             backend = self._engine.alone(row, self._make, is_built=bool(self._built[row]))
-            world = self._new(**self._options, backend=backend)
+            world = self._new(**(self._options or {}), backend=backend)
             done = self._done[row]
             if done is not None and self._origin is not None:
                 own = self._tables[done.compiled].row(row)
@@ -170,7 +170,7 @@ class Batch:
                 self._versions[row] = world.version
             world._closed |= self._is_closed
             self._worlds[row], self._exists[row] = world, True
-            self._done[row], self._acts_alone[row] = None, False
+            self._done[row], self._acts_alone[row] = None, world.acts_alone
         return world
 
     def _new(self, **options: Any) -> Simulation:
@@ -227,7 +227,7 @@ class Batch:
             found[row] = self._alone(row).index
         return found
 
-    def values(self, *, where: Any = None) -> dict[str, Value]:
+    def values(self, *, where: Mask | None = None) -> dict[str, Value]:
         """Return the present values of all variables that the selected worlds have.
 
         Args:
@@ -257,7 +257,7 @@ class Batch:
         *,
         seed: int | Sequence[int | None] | None = None,
         episode: int | Sequence[int] = 0,
-        where: Any = None,
+        where: Mask | None = None,
         do: Mapping[str, Any] | None = None,
         space: AnyRegion | None = None,
     ) -> Audits:
@@ -438,7 +438,7 @@ class Batch:
         self,
         request: Mapping[str, Any],
         *,
-        where: Any = None,
+        where: Mask | None = None,
         space: AnyRegion | None = None,
         on_refusal: Literal["raise", "skip"] = "raise",
     ) -> Audits:
@@ -548,9 +548,8 @@ class Batch:
         self._place[rows] = places
         self._where[rows] = one.where[places]
         self._changes += 1
-        commands = one.compiled.composition.commands
-        if commands is not None:
-            self._acts_alone[rows] = commands.applies(Rows(one.compiled, table.numbers[rows]))
+        commands, now = one.compiled.composition.commands, Rows(one.compiled, table.numbers[rows])
+        self._acts_alone[rows] = commands is not None and commands.applies(now)
         if self.names:
             table.evaluate(self.names, rows)
 
@@ -643,7 +642,7 @@ class Batch:
                 raise
         return found
 
-    def step(self, actions: ArrayLike, *, where: Any = None) -> None:
+    def step(self, actions: ArrayLike, *, where: Mask | None = None) -> None:
         """Advance some worlds one control step.
 
         Args:
@@ -721,9 +720,7 @@ class Batch:
         groups, sent = self._groups(rows), commands
         held: dict[int, Held] = {}
         late: Mapping[int, Floats] = within
-        there: Any = self._worlds
-        alone = [row for row in self._existing(rows) if there[row].acts_alone]
-        alone += rows[self._acts_alone[rows]].tolist()
+        alone = rows[self._acts_alone[rows]].tolist()
         if alone:
             others = np.setdiff1d(rows, alone)
             commands, sent, late, held = self._decide(alone, others, commands, within)
@@ -857,6 +854,7 @@ class Batch:
         world = self._alone(row)
         world._require_episode()
         self._kind[row] = self._number((world.compiled, world.substeps))
+        self._acts_alone[row] = world.acts_alone
         table = self._tables[world.compiled]
         if world.row.numbers.base is not table.numbers:
             world.move(table.row(row))
@@ -916,7 +914,7 @@ def located(error: ScmWorldError, index: int, what: str) -> ScmWorldError:
     return error
 
 
-def read_seeds(seed: Any, size: int) -> list[Any]:
+def read_seeds(seed: object, size: int) -> list[Any]:
     """Return the seed of each world; one seed counts up."""
     if seed is None:
         return [None] * size
@@ -959,18 +957,20 @@ def of_row(
     return found
 
 
-def read_mask(name: str, mask: Any, size: int) -> Mask:
+def read_mask(name: str, mask: object, size: int) -> Mask:
     """Return a checked boolean mask of worlds; all if None."""
     if mask is None:
         return np.ones(size, bool)
-    read = isinstance(mask, np.ndarray) and mask.shape == (size,) and mask.dtype == np.bool_
-    if not (read and mask.any()):
+    is_array = isinstance(mask, np.ndarray) and mask.dtype == np.bool_ and mask.shape == (size,)
+    if not is_array or not np.asarray(mask).any():
         allowed = (f"an array of {size} truth values, at least one of them true",)
         raise UnknownOption(name, mask, allowed)
     return np.array(mask)
 
 
-def read_actions(actions: Any, which: Mask | None, shape: tuple[int, int], what: str) -> Floats:
+def read_actions(
+    actions: ArrayLike, which: Mask | None, shape: tuple[int, int], what: str
+) -> Floats:
     """Return the checked actions of all worlds, of which ``which`` are stepped, in a shape.
 
     A world is called ``what`` in errors.

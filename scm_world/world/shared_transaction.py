@@ -75,8 +75,8 @@ class SharedTransaction:
         structure: Structure,
         compiled: CompiledTask,
         now: Floats,
-        where: Any,
-        seeds: Any,
+        where: NDArray[np.uint64],
+        seeds: Sequence[int],
         below: tuple[SharedTransaction, Integers] | None = None,
     ) -> None:
         self.structures, self.structure, self.compiled = structures, structure, compiled

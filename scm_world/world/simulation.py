@@ -51,7 +51,7 @@ from scm_world.world.interventions import (
 from scm_world.world.mechanisms import Rows
 from scm_world.world.philox import CompiledNoise
 from scm_world.world.snapshot import Base, Snapshot
-from scm_world.world.structures import StructureCache
+from scm_world.world.structures import StructureCache, structures_of
 from scm_world.world.system import CausalSystem
 
 if TYPE_CHECKING:
@@ -159,7 +159,7 @@ class Simulation(CausalSystem):
         if shared is not None and replace(shared.options, steps=0) != options:
             name, allowed = "options of a world with these structures", (str(shared.options),)
             raise UnknownOption(name, options, allowed)
-        self.structures = shared or StructureCache(kind, options)
+        self.structures = shared or structures_of(kind, options)
         self.deciding, self.policies = self.structures.deciding, kind.policies
         self.options = self.structures.options
         self._checked = False
