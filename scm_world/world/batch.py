@@ -11,7 +11,7 @@ from typing import Any, Literal, Self
 
 import numpy as np
 
-from scm_world._arguments import one_of, real_numbers, typed, whole_number
+from scm_world._arguments import EPISODES, one_of, real_numbers, typed, whole_number
 from scm_world._types import ArrayLike, Floats, Integers, Mask, Value
 from scm_world.backends import Backend, Capabilities, make_backend
 from scm_world.errors import (
@@ -55,6 +55,10 @@ class Batch:
         threads: Number of threads of a backend with several; the number of cores if None.
         names: Variables that are computed after every step.
 
+    Attributes:
+        names: As given; they may be replaced.
+        threads: As given.
+
     Raises:
         UnknownOption: The worlds differ in task, options or engine, or ``threads`` is not a
             positive whole number.
@@ -81,7 +85,7 @@ class Batch:
             raise UnknownOption("worlds", kinds, ("worlds of one task, options and engine",))
         self._set_up(given[0], given, len(given), threads, names)
         backends = [world.backend for world in given]
-        self._engine = backends[0].batch.of(backends, self._threads)
+        self._engine = backends[0].batch.of(backends, self.threads)
 
     def _set_up(
         self,
@@ -91,8 +95,8 @@ class Batch:
         threads: int | None,
         names: Iterable[str],
     ) -> None:
-        self._threads = cores() if threads is None else whole_number("threads", threads, least=1)
-        self._names, self._all = tuple(names), np.arange(n)
+        self.threads = cores() if threads is None else whole_number("threads", threads, least=1)
+        self.names, self._all = tuple(names), np.arange(n)
         self._first, self._structures = first, first.structures  # what all worlds have in common
         self._tables: dict[CompiledTask, Rows] = {}
         self._kinds: list[tuple[CompiledTask, int]] = []  # structures, and physics steps
@@ -150,7 +154,7 @@ class Batch:
         made = cls.__new__(cls)
         made._set_up(first, [None] * n, n, threads, names)
         made._options = {n: value for n, value in options.items() if n not in ("backend", "device")}
-        made._engine = first.backend.batch.made_by(made._make, n, made._threads)
+        made._engine = first.backend.batch.made_by(made._make, n, made.threads)
         return made
 
     def _alone(self, row: int) -> Simulation:
@@ -172,6 +176,11 @@ class Batch:
     def _new(self, **options: Any) -> Simulation:
         return type(self._first)(self._structures, **options)
 
+    @property
+    def first(self) -> Simulation:
+        """A world like these, of which no episode has begun."""
+        return self._first
+
     def _existing(self, rows: Integers) -> list[int]:
         """List which of some worlds exist by themselves."""
         found: list[int] = rows[self._exists[rows]].tolist()
@@ -189,7 +198,7 @@ class Batch:
             NotReset: No episode has begun in one of the worlds.
         """
         parts = []
-        for table, rows in self._by_structure(self._all):
+        for table, rows in self.by_structure(self._all):
             table.compiled.model.declared(name)
             table.evaluate((name,), rows)
             parts.append((table[name][rows], rows))
@@ -204,7 +213,7 @@ class Batch:
     def tensor(self, name: str) -> Any:
         """Return a state of all worlds, shape (n, size); see ``Simulation.tensor``."""
         self._require_states(self._all)
-        for table, _ in self._by_structure(self._all):
+        for table, _ in self.by_structure(self._all):
             table.compiled.model.declared(name)
         return self._engine.tensor(self._all, name)
 
@@ -232,7 +241,7 @@ class Batch:
         """
         rows = np.flatnonzero(read_mask("where", where, len(self)))
         found: dict[str, Value] = {}
-        for table, members in self._by_structure(rows):
+        for table, members in self.by_structure(rows):
             table.evaluate(None, members)
             common = [name for name in table.compiled.model if not found or name in found]
             there = np.searchsorted(rows, members)
@@ -247,6 +256,7 @@ class Batch:
         self,
         *,
         seed: int | Sequence[int | None] | None = None,
+        episode: int | Sequence[int] = 0,
         where: Mask | None = None,
         do: Mapping[str, Any] | None = None,
         space: AnyRegion | None = None,
@@ -255,6 +265,7 @@ class Batch:
 
         Args:
             seed: Seed of the first world, from which the others count up; or a list of seeds.
+            episode: Number of the episode of every world with a seed, or a list of n numbers.
             where: Boolean mask of the worlds to reset, shape (n,); all if None.
             do: As in ``do``.
             space: As in ``do``.
@@ -266,48 +277,54 @@ class Batch:
             InterventionError: The intervention was refused; the message names the world. The
                 episodes of all selected worlds have begun without it.
         """
-        seeds, request = read_seeds(seed, len(self)), request_of(do)
+        seeds, numbers = read_seeds(seed, len(self)), read_numbers(episode, len(self))
+        request = request_of(do)
         rows = np.flatnonzero(read_mask("where", where, len(self)))
         there = [self._first, *map(self._alone, self._existing(rows))]
         has_context = bool(getattr(request, "context", ()))  # a plan with layers, for all alike
         planned = has_times(request) or any(getattr(world, "plan", ()) for world in there)
         if not (planned or has_context):
-            self._begin_all(rows, seeds)
+            self._begin_all(rows, seeds, numbers)
             return self._do(request, rows, space) if request else Audits({}, {})
         flat = flatten(request)
 
         def begin(row: int) -> Audit | None:
             asked = request if has_context else self._request(row, flat)
-            return self._alone(row).reset(seed=seeds[row], do=asked, space=space)
+            how = {"seed": seeds[row], "episode": numbers[row]}
+            return self._alone(row).reset(**how, do=asked, space=space)
 
         try:
             found = self._everywhere(rows, begin)
         except ScmWorldError as error:
             if not isinstance(error, EngineFailure):
-                self._everywhere(rows, lambda row: self._alone(row).reset(seed=seeds[row]))
+                self._everywhere(
+                    rows,
+                    lambda row: self._alone(row).reset(seed=seeds[row], episode=numbers[row]),
+                )
             raise
         return Audits({row: audit for row, audit in found.items() if audit is not None}, {})
 
-    def _begin_all(self, rows: Integers, seeds: Sequence[Any]) -> None:
+    def _begin_all(self, rows: Integers, seeds: Sequence[Any], numbers: Sequence[int]) -> None:
         """Begin an episode without interventions in some worlds, or in none of them."""
         back: list[Callable[[], None]] = []
-        alike = self._begins_alike()
+        alike = self.begins_alike()
         apart = [row for row in rows.tolist() if row in self._shown or not alike]
         try:
             self._everywhere(
                 np.array(apart, dtype=int),
-                lambda row: self._alone(row).reset(seed=seeds[row]),
+                lambda row: self._alone(row).reset(seed=seeds[row], episode=numbers[row]),
                 back,
             )
             if len(apart) < len(rows):
                 together = np.setdiff1d(rows, apart)
-                self._begin_together(together, [seeds[row] for row in together.tolist()], back)
+                each = [(seeds[row], numbers[row]) for row in together.tolist()]
+                self._begin_together(together, each, back)
         except BaseException:
             for undo in reversed(back):
                 undo()
             raise
 
-    def _begins_alike(self) -> bool:
+    def begins_alike(self) -> bool:
         """Return whether what is drawn at the beginning is numbers that move no body."""
         if any(variable.own_noise is not None for variable in self._structures.head.variables):
             return False
@@ -317,14 +334,17 @@ class Batch:
         return not moves and natural.composition.structural.isdisjoint(order)
 
     def _begin_together(
-        self, rows: Integers, seeds: Sequence[Any], back: list[Callable[[], None]]
+        self, rows: Integers, each: Sequence[tuple[Any, int]], back: list[Callable[[], None]]
     ) -> None:
-        """Begin an episode in worlds that begin alike; see ``Simulation._begin``."""
+        """Begin an episode in worlds that begin alike; see ``Simulation._begin``.
+
+        ``each`` has the seed and the number of the episode of each world.
+        """
         natural, engine = self._structures.natural(None), self._engine
         where, own, built = self._where[rows], list[int](), self._built[rows]
         where[:, 2] = 0
         lost = np.zeros(len(rows), bool)
-        for place, (row, seed) in enumerate(zip(rows.tolist(), seeds, strict=True)):
+        for place, (row, (seed, number)) in enumerate(zip(rows.tolist(), each, strict=True)):
             world, there = self._worlds[row], self._done[row] is not None
             if world is not None:
                 built[place] = there = world.has_begun
@@ -334,7 +354,8 @@ class Batch:
                 own.append(CompiledNoise(seed).seed)
             else:
                 own.append(self._seeds[row] if there else secrets.randbits(63))
-            where[place, 1] = where[place, 1] + np.uint64(1) if there and seed is None else 0
+            following = where[place, 1] + np.uint64(1) if there else 0
+            where[place, 1] = following if seed is None else number
         where[:, 0] = [word_of(f"seed {seed}") for seed in own]
         fresh, again, kept = rows[~built], rows[built], rows[built & ~lost]
         if kept.size:
@@ -516,8 +537,8 @@ class Batch:
         self._acts_alone[rows], commands = False, one.compiled.composition.commands
         if commands is not None:
             self._acts_alone[rows] = commands.applies(Rows(one.compiled, table.numbers[rows]))
-        if self._names:
-            table.evaluate(self._names, rows)
+        if self.names:
+            table.evaluate(self.names, rows)
 
     def _write(
         self, one: RowMemory, members: Integers, table: Rows, back: list[Callable[[], None]]
@@ -662,9 +683,9 @@ class Batch:
     def table(self, index: int) -> Rows:
         """Return the rows of all worlds with the structure of one world."""
         index = self._numbered(index)
-        return self._by_structure(self._all[index : index + 1])[0][0]
+        return self.by_structure(self._all[index : index + 1])[0][0]
 
-    def _by_structure(self, rows: Integers) -> list[tuple[Rows, Integers]]:
+    def by_structure(self, rows: Integers) -> list[tuple[Rows, Integers]]:
         """Return the rows of some worlds by structure, with the numbers of these worlds."""
         return [(self._tables[kind[0]], members) for kind, members in self._groups(rows)]
 
@@ -726,7 +747,7 @@ class Batch:
         if failed is not None:
             raise failed
         for (compiled, _), members in groups:
-            self._tables[compiled].evaluate(self._names, members)
+            self._tables[compiled].evaluate(self.names, members)
 
     def _decide(
         self, alone: list[int], others: Integers, commands: Floats, within: Mapping[int, Floats]
@@ -809,7 +830,7 @@ class Batch:
             self._fill(row)
         if changed:
             for (compiled, _), members in self._by_kind(np.array(changed)):
-                self._tables[compiled].evaluate(self._names, members)
+                self._tables[compiled].evaluate(self.names, members)
             for row in changed:
                 self._versions[row] = there[row].version
         return self._by_kind(rows)
@@ -855,10 +876,10 @@ class Batch:
     def __reduce__(self) -> tuple[Any, ...]:
         """Return the parts for copying and pickling."""
         if self._options is None:
-            return partial(type(self), threads=self._threads, names=self._names), (self._worlds,)
+            return partial(type(self), threads=self.threads, names=self.names), (self._worlds,)
         begun = {row: self._alone(row) for row in np.flatnonzero(self._kind >= 0).tolist()}
         saved = {row: world.snapshot() for row, world in begun.items() if world.has_begun}
-        given = self._options, len(self), self._threads, self._names
+        given = self._options, len(self), self.threads, self.names
         return _copied, (type(self), saved, self._first, *given)
 
     def close(self) -> None:
@@ -902,6 +923,14 @@ def read_seeds(seed: object, size: int) -> list[Any]:
     if len(seed) != size:
         raise UnknownOption("seed", seed, ("a whole number", f"a list of {size} of them or None"))
     return [*seed]
+
+
+def read_numbers(episode: Any, size: int) -> list[int]:
+    """Return the number of the episode of each world; one number is that of all."""
+    each = [*episode] if np.ndim(episode) else [episode] * size
+    if len(each) != size:
+        raise UnknownOption("episode", episode, ("a whole number", f"a list of {size} of them"))
+    return [whole_number("episode", number, least=0, most=EPISODES) for number in each]
 
 
 def values_of_each(model: SCM, request: Mapping[str, Any], count: int) -> dict[str, Any]:
