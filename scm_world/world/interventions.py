@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import chain
 from typing import Any, NamedTuple, final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from scm_world._types import Value
+from scm_world._types import Floats, Value
 from scm_world.errors import (
     ClosesCycle,
     ConflictingTargets,
@@ -18,6 +19,7 @@ from scm_world.errors import (
     InterventionError,
     NotIntervenable,
     OutOfBounds,
+    ScmWorldError,
     UnknownVariable,
     WrongValue,
     in_one_line,
@@ -106,8 +108,8 @@ class Transaction:
     """A checked intervention, and the world after it for one noise key.
 
     The constructor accepts the request and mutilates the model; ``solve`` computes ``row`` for one
-    noise key; ``compare`` finds which parameters have ``changed``, the ``change`` of the backend,
-    and overlaps; ``held`` and ``kept`` return what remains. Arguments are those of ``feasible``.
+    noise key, which parameters have ``changed``, and the ``change`` of the backend; ``remains``
+    returns the model and what is pending. Arguments are those of ``feasible``.
 
     Attributes:
         base: The base in the requested structure.
@@ -118,12 +120,15 @@ class Transaction:
         relative: Shifts and scales by the numbers that were drawn for them, by requested name.
         model: The model with the interventions that would be in force, draws among them.
         problems: The errors that do not depend on draws.
+        order: The targets among the parameters and what follows from them, causes first.
+        draws: The targets that are drawn.
         attempts: The attempt of each draw beneath what is asked, by variable; see ``stacked``.
     """
 
     row: Rows
     change: Difference | None = None
     attempts: Mapping[str, int] | None = None
+    _own: frozenset[str] = frozenset()  # targets on which each of several rows has its own
 
     def __init__(
         self,
@@ -147,14 +152,15 @@ class Transaction:
         there, by_hand = self.compiled.where, self.compiled.set_by_hand
         self.acts = {t: named for t, named in self.pending.items() if t in there}
         self._states = [t for t in self.acts if t in by_hand]
-        moving = self._refused_mechanisms()
+        computing = [t for t, (_, act) in self.acts.items() if act.root.computes]
+        moving = self._refused_mechanisms(computing) if computing else {}
         self.problems += {problem.variable: problem for problem in moving.values()}.values()
         self._impossible = {*moving}  # what has no possible value
         self._boxes: Any = (), ()  # draws from boxes that follow nothing; see ``boxes``
-        self._draws: list[str] = []
+        self.draws: list[str] = []
         self.changed: list[str] = []
         self._targets: tuple[str, ...] = ()
-        self._order: tuple[str, ...] = ()
+        self.order: tuple[str, ...] = ()
         if len(self._states) < len(self.acts):
             self._mutilate({t: named for t, named in self.acts.items() if t not in by_hand})
         self._always_impossible = frozenset(self._impossible)
@@ -243,21 +249,20 @@ class Transaction:
         out.update(*[problem.cycle for problem in cycles])
         static = compiled.static
         self._targets = tuple([t for t in acts if t in static and t not in out])
-        self._draws = [target for target in draws if target in self._targets]
+        self.draws = [target for target in draws if target in self._targets]
         if self.model.adds_edges:
             structure = self.model.structure
             follow = {*self._targets, *structure.instant_descendants(self._targets)}
-            self._order = tuple(n for n in structure.order if n in follow and n in static)
+            self.order = tuple(n for n in structure.order if n in follow and n in static)
         else:
-            self._order = compiled.static_order(self._targets)
+            self.order = compiled.static_order(self._targets)
 
-    def _refused_mechanisms(self) -> dict[str, InterventionError]:
+    def _refused_mechanisms(self, computing: list[str]) -> dict[str, InterventionError]:
         """Return an error for each mechanism with a moving parent, or that fails now."""
         found: dict[str, InterventionError] = {}
         compiled, row = self.compiled, self.base.row
-        for target, (name, act) in self.acts.items():
-            if not act.root.computes:
-                continue
+        for target in computing:
+            name, act = self.acts[target]
             whole = compiled.model._applied(name, act)
             requested = whole.root.requested
             asked, parents = requested.name, whole.root.intervention.follows(requested)
@@ -297,10 +302,11 @@ class Transaction:
     # --- solving ------------------------------------------------------------------------------
 
     @np.errstate(all="ignore")  # values that are not finite are refused by name
-    def solve(self, key: NoiseKey) -> list[InterventionError]:
+    def solve(self, key: NoiseKey, now: Base) -> list[InterventionError]:
         """Solve for the parameters, then for the states; return the problems.
 
-        A mechanism is not called with invalid values of its parents.
+        A mechanism is not called with invalid values of its parents. Without problems, the
+        differences from the present ``now`` are ``changed`` and ``change``.
         """
         drawn, groups = self._boxes
         self._known: dict[str, tuple[str, Any]] = {}  # see ``settled``
@@ -313,26 +319,101 @@ class Transaction:
             found = uniforms(key, np.array(words, dtype=np.uint64), len(low[0]))
             numbers[columns] = low + edges * found
         self.row.unknown.difference_update(drawn)
-        declared, acts = self.compiled.model.declared, self.acts
-        for name in self._order:
+        bounded, acts = self.compiled.bounded, self.acts
+        for name in self.order:
             if name in drawn:
                 continue
             asked, act = acts.get(name, (name, None))
-            bounds = declared(name).bounds
-            follows = bounds is not None and bool(bounds.parents())
-            constant = None if act is None or asked != name or follows else act.constant
+            free = act is not None and asked == name and name not in bounded
+            constant = act.constant if free else None  # type: ignore[union-attr]
             if constant is not None:
                 self.row[name] = constant  # it has been checked
             else:
-                self._compute(name, follows=follows)
-        carries = not self.compiled.carriers.isdisjoint(self._order)
+                self._compute(name, follows=name in bounded)
+        carries = not self.compiled.carriers.isdisjoint(self.order)
         if (carries or self._states or self.base.fresh) and self._impossible.isdisjoint(
             self._deciding
         ):
             self._set_states()
         if self.space is not None:
             self._check_space(self.space)
-        return self._as_asked() if self._wrong else []
+        if self._wrong:
+            return self._as_asked()
+        self.changed = now.row.differing(self.row)
+        self.change = difference(now, self.row, self.changed)
+        return []
+
+    def obstacles(self, now: Base, draws: Collection[str]) -> list[Any]:
+        """List overlaps deeper than those that physics left; or where draws may not put a body."""
+        found: list[Any] = []
+        if self.change is not None:
+            found = overlaps(self.base, now, self.row, self.change, self.asked)
+        composition = self.compiled.composition
+        if composition.kept_clear and draws and not found:  # of values, all are allowed
+            varied = self.compiled.reached(draws)
+            if not composition.kept_clear.isdisjoint(varied):
+                found = [*composition.obstructed(self.compiled.scene(self.row), varied)]
+        return found
+
+    def solve_rows(
+        self,
+        bases: Rows,
+        now: Rows,
+        where: NDArray[np.uint64],
+        key: Callable[[int], NoiseKey],
+        own: Mapping[str, Any],
+    ) -> tuple[Floats, list[int]]:
+        """Solve for worlds that differ in their numbers and their noise only.
+
+        Args:
+            bases: Their rows as physics left them.
+            now: Their present rows.
+            where: The key of the seed, the episode and the control step of each, shape (m, 3).
+            key: Returns the noise key of one of them.
+            own: What each has of its own, by target: values, shape (m, *shape), or interventions,
+                shape (m,).
+
+        Returns:
+            The rows afterwards, shape (m, width), and the places of those that refuse it, or have
+            to draw again.
+        """
+        numbers, acts = bases.numbers.copy(), dict(self.acts)
+        drawn, groups = self._boxes
+        found = Rows(self.compiled, numbers)
+        constants: dict[str, Any] = {t: a.constant for t, (name, a) in acts.items() if name == t}
+        constants |= {t: None if one.dtype == object else one for t, one in own.items()}
+        free = {*drawn, *(t for t, one in constants.items() if one is not None)}
+        special = (self.compiled.bounded, self.compiled.material, self.compiled.carriers)
+        plain = free.issuperset(self.order) and all(s.isdisjoint(self.order) for s in special)
+        if plain and not (self._states or self.space):
+            for names, streams, columns, low, edges in groups:
+                words = [words_of(*one, range(1)) for one in zip(names, streams, strict=True)]
+                uniform = uniforms(where, np.concatenate(words), len(low[0]))
+                numbers[:, columns] = low + edges * uniform
+            for name in self.order:
+                if name not in drawn:
+                    found[name] = constants[name]
+            return numbers, []
+        refused, draws = list[int](), [n for n, act in acts.values() if act.root.draws]
+        self._own = frozenset(own)
+        for place in range(len(numbers)):
+            for target, each in own.items():
+                one = each[place]
+                act = one if isinstance(one, Intervention) else Hard.of(np.asarray(one))
+                self.acts[target] = target, act
+                if target in self.pending:
+                    self.pending[target] = target, act
+            self.base = replace(self.base, row=bases.row(place))
+            before = replace(self.base, row=now.row(place))
+            try:
+                wrong: Any = self.solve(key(place), before) or self.obstacles(before, draws)
+            except ScmWorldError:
+                wrong = True
+            if wrong or (self.change is not None and self.change.structure is not None):
+                refused.append(place)
+            else:
+                numbers[place] = self.row.numbers
+        return numbers, refused
 
     def _compute(self, name: str, *, follows: bool) -> None:
         """Compute a parameter after its parents; its bounds may depend on others."""
@@ -341,7 +422,11 @@ class Transaction:
             impossible.add(name)
             return
         try:
-            value = self.model.evaluate(name, self.row, self._key)
+            applied = None
+            if name in self._own:
+                act = self.acts[name][1].on(self.model._beneath(name))
+                applied = self.model._applied(name, act)
+            value = self.model.evaluate(name, self.row, self._key, applied)
             if value.shape != variable.shape:  # of a mechanism that a user gave
                 raise WrongValue(name, value, variable.shape, np.shape(value))
             check_bounds(variable, value, self.row if follows else {})
@@ -357,7 +442,7 @@ class Transaction:
         for target in self._states:
             if target not in followed:
                 self._set_state(target)
-        moved = {*self._order, *self._states}
+        moved = {*self.order, *self._states}
         for name, parents in followed.items():
             if name in moved or name in fresh or not moved.isdisjoint(parents):
                 self._set_state(name)
@@ -459,14 +544,6 @@ class Transaction:
 
     # --- bodies and repeated draws --------------------------------------------------------------
 
-    def compare(self, before: Base) -> list[Overlap]:
-        """Compute the changes; return overlaps deeper than those that physics left."""
-        self.changed = before.row.differing(self.row)
-        self.change = difference(before, self.row, self.changed)
-        if self.change is None:
-            return []
-        return overlaps(self.base, before, self.row, self.change, self.asked)
-
     def screened_draws(self, key: NoiseKey, attempts: range, draws: list[str]) -> Iterator[int]:
         """Yield the draws that pass the screening for overlaps, and the last one."""
         composition = self.compiled.composition
@@ -510,7 +587,7 @@ class Transaction:
                 values = drawn[whole][:, first : first + values.size]
             elif act is not None and asked == name and act.constant is not None:
                 values = np.ravel(act.constant)
-            elif act is not None or name in self._order or name in compiled.set_parents:
+            elif act is not None or name in self.order or name in compiled.set_parents:
                 return None
             rows[name] = np.broadcast_to(values, (n, where[name].stop - where[name].start))
         return rows
@@ -543,13 +620,13 @@ class Transaction:
         value = model.evaluate(target, self.row, self._key, model._applied(name, below))
         return act.on((target, Hard.of(value)))
 
-    def held(self) -> SCM:
-        """Return the model with the interventions that would be in force, draws as their values."""
-        drawn = dict([self.settled(target) for target in self._draws])
-        return self.model._with_interventions(drawn) if drawn else self.model
+    def remains(self) -> tuple[SCM, PendingInterventions]:
+        """Return the model that would be in force, and the interventions at this control step.
 
-    def kept(self) -> PendingInterventions:
-        """Return the interventions at this control step, draws as their values."""
+        Draws are their values there.
+        """
+        drawn = dict([self.settled(target) for target in self.draws])
+        model = self.model._with_interventions(drawn) if drawn else self.model
         by_hand, actions = self.compiled.set_by_hand, self.compiled.actions
         found: PendingInterventions = {}
         for target, named in self.pending.items():
@@ -560,10 +637,9 @@ class Transaction:
                 found[target] = self.settled(target)
             else:
                 found[target] = target, Hard.of(self.row[target])
-        removals = self.request.items()
-        return found | {
-            name: (name, act) for name, act in removals if getattr(act, "removes", False)
-        }
+        asked = self.request.items()
+        found |= {name: (name, act) for name, act in asked if getattr(act, "removes", False)}
+        return model, found
 
 
 # --- bodies ----------------------------------------------------------------------------------
@@ -663,22 +739,17 @@ def feasible(
         end = min(first + CHUNK, ATTEMPTS) if deciding else ATTEMPTS
         attempts = range(first, end if again else first + 1)
         for attempt in done.screened_draws(key, attempts, again) if again else attempts:
-            wrong = done.solve(replace(key, attempt=attempt) if attempt else key)
+            wrong = done.solve(replace(key, attempt=attempt) if attempt else key, now)
             if wrong:
                 raise_all(wrong)
-            problems = done.compare(now)
-            composition = done.compiled.composition
-            if composition.kept_clear and draws and not problems:  # of values, all are allowed
-                varied = done.compiled.reached(draws)
-                if not composition.kept_clear.isdisjoint(varied):
-                    problems = [*composition.obstructed(done.compiled.scene(done.row), varied)]
+            problems = done.obstacles(now, draws) if draws or done.change is not None else []
             if not problems:
                 return done
             tried = f"with the draws of episode {key.episode}, " if fixed else ""
             if draws:
                 tried = f"none of {ATTEMPTS:,} draws was feasible; in the last one "
             moved = {name.partition(".")[0] for name in done.compiled.reached(again)}
-            unmoved = {*composition.bodies} - moved
+            unmoved = {*done.compiled.composition.bodies} - moved
             if draws and (not again or any(unmoved.issuperset(o.bodies) for o in problems)):
                 tried = tried if deciding else "for every draw, "
                 break
@@ -757,6 +828,7 @@ def _nearest(
     for _ in range(20):
         middle = 0.5 * (low + high)
         done = Transaction(structures, base, between(middle), None, key)
-        blocked = done.solve(key) or done.compare(now)  # outside the bounds, or in another body
+        # Outside the bounds, or in another body:
+        blocked: Any = done.solve(key, now) or done.obstacles(now, ())
         low, high = (low, middle) if blocked else (middle, high)
     return between(low)[wanted]
