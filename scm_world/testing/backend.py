@@ -468,7 +468,7 @@ class BackendConformance(ABC):
 
     @pytest.mark.parametrize("n", [1, 7])
     def test_a_lost_state_is_that_of_its_scene(
-        self, scene: Scene, n: int, monkeypatch: Any, tmp_path: Path
+        self, scene: Scene, n: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     ) -> None:
         """It is named; all others are stepped, and a snapshot brings it back."""
         monkeypatch.chdir(tmp_path)  # engines may write a log
@@ -493,7 +493,7 @@ class BackendConformance(ABC):
 
     @pytest.mark.parametrize("together", [False, True])
     def test_an_explosion_is_an_error(
-        self, backend: Backend, together: bool, monkeypatch: Any, tmp_path: Path
+        self, backend: Backend, together: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     ) -> None:
         """A state that is not finite is never returned, also not from a batch."""
         monkeypatch.chdir(tmp_path)  # engines may write a log
