@@ -543,7 +543,7 @@ def test_readouts_are_measurements(world: sw.World) -> None:
         (lambda d: d.assign(**{"hinge.position": "low"}), ModelError, "not numbers"),
         (lambda d: [d, d.assign(knee=0.0)], ModelError, "run 2: rename .* 'knee'"),
         (lambda d: {"time": d.time, "hinge.position": [0.0]}, ModelError, "a row for each instant"),
-        (lambda d: 5, UnknownOption, ".csv, .parquet or .npz"),
+        (lambda d: 5, UnknownOption, ".csv, .txt, .tsv, .parquet or .npz"),
         (lambda d: [], UnknownOption, "one or more runs"),
         (lambda d: "missing.csv", UnreadableFile, "there is no such file; give the path"),
         (lambda d: "run.mat", UnknownOption, ".csv, .txt, .tsv, .parquet, .npz"),
@@ -690,7 +690,7 @@ def test_the_command(damped: pd.DataFrame, tmp_path: Path, monkeypatch: Any) -> 
     assert done.exit_code == 0, done.output
     why = json.loads(Path("why/result.json").read_text())["explanation"]
     assert {"none", "hinge.damping", "hinge.armature", "delay"} <= {r["parameters"] for r in why}
-    done = CliRunner().invoke(app, [*words[:3], "--parameters", "knee.*"])
+    done = CliRunner().invoke(app, [*words[:3], *more[-4:], "--parameters", "knee.*"])
     assert done.exit_code == 2
     assert "no variable fits the pattern 'knee.*'" in done.output
 
