@@ -34,7 +34,7 @@ class Pendulums(Checkable):
 
     def __init__(self, n: int = 3) -> None:
         self.num_envs = n
-        self.values = {name: np.ones(n) for name in ("mass", "damping")}
+        self.values = {name: np.ones(n) for name in ("mass", "damping", "length")}
         self.state, self.rngs = np.zeros((n, 2)), [np.random.default_rng(i) for i in range(n)]
 
     def get(self, name: str) -> Any:
@@ -56,7 +56,9 @@ class Pendulums(Checkable):
         angle, speed = self.state.T
         torque = actions[:, 0] - self.values["damping"] * speed
         noise = np.array([rng.normal() for rng in self.rngs])
-        speed = speed + 0.05 * (torque / self.values["mass"] - 9.81 * np.sin(angle) + noise)
+        speed = speed + 0.05 * (
+            torque / self.values["mass"] - 9.81 * np.sin(angle) / self.values["length"] + noise
+        )
         self.state = np.stack([angle + 0.05 * speed, speed], axis=1)
 
     def observe(self) -> Any:
@@ -205,6 +207,11 @@ class UndoLeavesSomething(Pendulums):
         self.values["mass"] = kept
 
 
+FAULTY = (NotWritten, OnNeighbours, Accumulates, AccumulatesInside, Later, LaterUnseen, Clips)
+"""In these, each parameter has the fault."""
+
+
+@pytest.mark.parametrize("n", [2, 3, 7])
 @pytest.mark.parametrize(
     ("made", "question"),
     [
@@ -222,10 +229,14 @@ class UndoLeavesSomething(Pendulums):
         (UndoLeavesSomething, "undo"),
     ],
 )
-def test_a_planted_fault_of_tensors_is_found(made: type[Pendulums], question: str) -> None:
-    """Each planted fault is the answer to its question."""
-    found = check(made(), MASS)
-    assert question in {asked for _, asked, _ in found.faults}, str(found)
+def test_a_planted_fault_of_tensors_is_found(made: type[Pendulums], question: str, n: int) -> None:
+    """Each planted fault is the answer to its question, whatever else is asked in the same runs."""
+    alone = check(made(n), MASS)
+    assert question in {asked for _, asked, _ in alone.faults}, str(alone)
+    beside = check(made(n), {"damping": (0.1, 1.0), **MASS, "length": (0.5, 2.0)})
+    assert question in {asked for name, asked, _ in beside.faults if name == "mass"}, str(beside)
+    if made not in (*FAULTY, ResetsDisturb):
+        assert {*beside.faults} == {*alone.faults}
 
 
 class Draws(Pendulums):

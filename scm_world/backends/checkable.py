@@ -91,6 +91,10 @@ class Checkable(ABC):
         del name
         return ""
 
+    def rounding(self) -> ArrayLike:
+        """Return differences after one step that are no effects, of all numbers or of each."""
+        return 0.0
+
     def idle(self, name: str, *, ran: bool) -> str:
         """Return why a parameter has no effect, or nothing.
 
@@ -119,8 +123,12 @@ class Checkable(ABC):
         if type(self).set is Checkable.set:
             return int
         kept = {name: np.array(self.get(name)) for name in names}
-        every = np.ones(self.num_envs, dtype=bool)
-        return lambda: [self.set(name, values, every) for name, values in kept.items()]
+
+        def back() -> None:
+            for name, values in kept.items():
+                self.set(name, values, np.ones(self.num_envs, dtype=bool))
+
+        return back
 
     def outdated(self) -> Floats | None:
         """Return by how much observations differ from those computed anew, shape (n,), or None."""

@@ -108,9 +108,11 @@ class Asking:
         self.limit = self.spread = np.ones(0)  # of each number of a state
         self.columns: list[tuple[str, str]] = []  # name and unit of each of them
         self.owners = np.empty(0, dtype=object)  # name of the variable of each of them
+        self.coupling = np.zeros(0)  # what is no response after a step, by values or one
         self.names: tuple[str, ...] = ()
         self._base: PairedRun | None = None  # a run without a change
         self._turn = 0
+        self._changed: list[str] = []  # names of values that a reset of another world changed
 
     def spaces(self, given: Mapping[str, Any] | None) -> dict[str, Distribution]:
         """Return the declared ranges as spaces; all values are read once."""
@@ -122,6 +124,7 @@ class Asking:
             )
         found = {name: self._space(name, one) for name, one in expanded.items()}
         self.names, self.columns = tuple(found), self.worlds.columns()
+        self.coupling = np.broadcast_to(self.worlds.rounding(), (len(self.columns),))
         self.owners = np.array([column.partition("[")[0] for column, _ in self.columns])
         return found
 
@@ -216,6 +219,7 @@ class Asking:
     def measure(self, first: Callable[[], object] = int) -> None:
         """Run twice without a change: the floor, and the spread of each number of a state."""
         one, other = self.run(first), self.run(first)
+        self._base = one
         kept = one.states[one.alive]
         with np.errstate(invalid="ignore"):
             spread, size = kept.std(axis=0), np.abs(kept).max(axis=0)
@@ -239,6 +243,20 @@ class Asking:
         step = int(np.flatnonzero(far.any(axis=(1, 2)))[0])
         sizes = far.max(axis=(0, 1))
         return Response(float(share.max()), float(sizes[column]), column, step)
+
+    def response(self, run: PairedRun, base: PairedRun, one: Asked) -> Response | None:
+        """Compare runs in the world of a range.
+
+        Where bodies that do not touch move one another, only the first step can tell.
+        """
+        if not self.coupling.any():
+            return self.gap(run, base, self.only(one), one.name)
+        here, there = (PairedRun(r.states[:2].copy(), r.alive[:2]) for r in (run, base))
+        room = self.coupling * np.maximum(
+            1.0, np.maximum(np.abs(here.states), np.abs(there.states))
+        )
+        np.copyto(here.states, there.states, where=_far(here.states, there.states) <= room)
+        return self.gap(here, there, self.only(one), one.name)
 
     def said(self, gap: Response | None, words: str) -> dict[str, Any]:
         """Return the text and the numbers of a difference in the state."""
@@ -270,42 +288,50 @@ class Asking:
         """
         found: dict[str, dict[str, Answer]] = {}
         idle, actions = {n for n in spaces if self.worlds.idle(n, ran=False)}, self.actions
-        for names in (idle, spaces.keys() - idle):
-            self.actions, self._base = actions[: 0 if names is idle else None], None
+        for names in (spaces.keys() - idle, idle):
+            if names is idle:
+                self.actions, self._base = actions[:0], None
             waiting = [Asked(name, space) for name, space in spaces.items() if name in names]
             while waiting:
                 alone = waiting[0].alone
                 group = waiting[: 1 if alone else max(1, self.n - 1)]
                 group = [one for one in group if one.alone == alone]
-                found |= self._ask(group)
+                found |= self._ask(group, tries=1 if names is idle else MOST)
                 waiting = [one for one in waiting if one.name not in found]
                 waiting.sort(key=lambda one: (one.alone, one.attempt))
                 tell(len(found))
         return found
 
-    def _ask(self, group: list[Asked]) -> dict[str, dict[str, Answer]]:
+    def _ask(self, group: list[Asked], tries: int) -> dict[str, dict[str, Answer]]:
         """Ask about ranges, each in a world of its own. Those without an answer are asked again."""
         alone, base = len(group) == 1, self._base or self.run()
-        found, last = self._choose(group)
+        found, last = self._choose(group, tries)
         asked = [one for one in group if one.name not in found]
+        if not asked:
+            return found
         first = self.run(partial(self._act, asked))
         self.worlds.reset(self.seed, self.all)
         for one in asked:
-            one.gap = self.gap(first, base, self.only(one), one.name)
+            one.gap = self.response(first, base, one)
             one.later = self.read(one.name)[one.world]
         quiet = {one for one in asked if one.gap is None and one not in last}
         loud = [one for one in asked if one not in quiet]
         # About half of them are set back while the others are set again; then the other way round.
+        # In the middle the last world is reset.
         self._turn += 1
         bit = self._turn % max(1, (self.n - 2).bit_length())
         back = {one for one in loud if one.world >> bit & 1}
-        again = self.run(partial(self._act, loud, back))
+        self._changed = []
+        again = self.run(partial(self._act, loud, back), int if alone else self._reset_last)
         for one in quiet:
-            one.gap, one.attempt = self.gap(again, base, self.only(one), one.name), one.attempt + 1
-            if one.gap is not None and alone:  # the value is in the engine from now on
+            one.gap = self.response(again, base, one)
+            if one.gap is None:
+                one.attempt += 1
+            elif alone:  # the value is in the engine from now on
                 one.late, loud = True, [one]
                 first, again = (self.run(partial(self._act, loud)) for _ in range(2))
-            one.alone |= one.gap is not None
+            else:
+                one.alone = True
         answers = self._answers(group, loud, back, base, first, again) if loud else {}
         self._set_back(group)
         faulty = any(a.status == "fault" for given in answers.values() for a in given.values())
@@ -314,11 +340,13 @@ class Asking:
             one.alone |= faulty
         return found | ({} if faulty and not alone else answers)
 
-    def _choose(self, group: list[Asked]) -> tuple[dict[str, dict[str, Answer]], set[Asked]]:
+    def _choose(
+        self, group: list[Asked], tries: int
+    ) -> tuple[dict[str, dict[str, Answer]], set[Asked]]:
         """Choose a value of each range: one that its world takes, and another one each time.
 
-        Returned are all answers about ranges without such a value, and those for which there is no
-        further one, or as many as are tried were.
+        Returned are all answers about ranges without such a value, and those of which no other one
+        is tried.
         """
         found: dict[str, dict[str, Answer]] = {}
         taken, why = dict.fromkeys(group, 0), dict[Asked, str]()
@@ -349,8 +377,8 @@ class Asking:
                 found[one.name] = none(
                     refused if one in why else "no other value lies in the range"
                 )
-        most = {one: min(taken[one], MOST - 1) for one in group}
-        return found, {one for one in group if one.attempt and one.attempt >= most[one]}
+        last = {one for one in group if one.attempt and taken[one] <= one.attempt}
+        return found, last | {one for one in group if one.attempt + 1 >= tries}
 
     def _act(self, ranges: Iterable[Asked], back: Collection[Asked] = ()) -> None:
         """Set the value of each range in its world; set some back again."""
@@ -393,15 +421,14 @@ class Asking:
         """
         alone, act = len(group) == 1, partial(self._act, asked)
         others = np.arange(self.n) >= len(group)
-        kept: dict[str, tuple[Floats, Floats]] = {}
-        middle = int if alone else partial(self._reset_last, kept)
+        middle: Any = int if alone else self._reset_last
         late = any(one.late for one in asked)
         undone = {one for one in asked if one not in back}
         final = again if late else self.run(partial(self._act, asked, undone), middle)
-        partly = self._partial(first, act) if alone else _unchanged(kept)
+        partly = self._partial(first, act) if alone else self._unchanged()
         taken, flat = self._taken(asked), dict[str, str]()
         clear = [one for one in asked if one.gap and taken[one].status == "passed" and not late]
-        if clear:
+        if clear and not self.coupling.any():
             flat = self._flat(clear, first if all(one.at == TARGETS[0] for one in clear) else None)
         self.worlds.reset(self.seed, self.all)
         act()
@@ -542,6 +569,8 @@ class Asking:
         why = self.worlds.idle(one.name, ran=True)
         if self.floor > 0.0:
             why = f"two equal runs differ by {self.floor:.3g} spreads, and no difference is larger"
+        if self.coupling.any() and not why:
+            why = "no difference after a step is larger than those of bodies that do not touch"
         said = f"no number of the state differs in {len(self.actions)} control steps"
         answer = missing(why) if why else Answer(status="fault", said=said)
         return {"responds": answer, "at once": missing("nothing responds")}
@@ -571,9 +600,11 @@ class Asking:
         """Reset the last world in the middle of a run."""
         if self.n == 1:
             return missing("there is one world")
-        kept: dict[str, tuple[Floats, Floats]] = {}
-        gap = self.gap(self.run(first, partial(self._reset_last, kept)), run, ~self._last)
-        found = _unchanged(kept)
+        self._changed = []
+        gap, found = (
+            self.gap(self.run(first, self._reset_last), run, ~self._last),
+            self._unchanged(),
+        )
         return (
             found
             if found.status == "fault"
@@ -584,11 +615,18 @@ class Asking:
     def _last(self) -> Mask:
         return np.arange(self.n) == self.n - 1
 
-    def _reset_last(self, kept: dict[str, tuple[Floats, Floats]]) -> None:
-        """Reset the last world; all values before and after are added to ``kept``."""
-        old = {name: self.read(name) for name in self.names}
+    def _reset_last(self) -> None:
+        """Reset the last world; values that change in others are kept."""
+        old = {name: self.read(name)[:-1] for name in self.names}
         self.worlds.reset(self.seed + OTHER, self._last)
-        kept |= {name: (old[name], self.read(name)) for name in self.names}
+        self._changed += [n for n in self.names if not _equal(old[n], self.read(n)[:-1])]
+
+    def _unchanged(self) -> Answer:
+        """Answer whether resets of the last world left the values of the others."""
+        if self._changed:
+            said = f"{self._changed[0]} changed in worlds that were not reset"
+            return Answer(status="fault", said=said)
+        return Answer(status="passed")
 
     def _constants(
         self,
@@ -651,7 +689,7 @@ class Asking:
             for one.values[0] in tried:
                 one.seen = []
                 run = self.run(act)
-                one.gap = self.gap(run, base, self.only(one), name)
+                one.gap = self.response(run, base, one)
                 if one.gap is not None:
                     break
             found |= self._responses(one)
@@ -683,14 +721,6 @@ class Asking:
             return Answer(status="passed")
         said = f"the first observation shows the values before: it differs by {old[0]:.3g}"
         return Answer(status="fault", said=said)
-
-
-def _unchanged(kept: Mapping[str, tuple[Floats, Floats]]) -> Answer:
-    """Answer whether a reset of the last world left the values of the others."""
-    for name, (old, new) in kept.items():
-        if not _equal(old[:-1], new[:-1]):
-            return Answer(status="fault", said=f"{name} changed in worlds that were not reset")
-    return Answer(status="passed")
 
 
 def _far(one: Floats, other: Floats) -> Floats:

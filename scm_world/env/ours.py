@@ -12,6 +12,7 @@ from scm_world.backends.checkable import Checkable, commands
 from scm_world.env.answers import TARGETS, at
 from scm_world.env.batch import ScmWorldVectorEnv
 from scm_world.errors import UnknownOption
+from scm_world.queries.experiments.paired import coupling
 from scm_world.variables import Draw, Scale, Shift
 from scm_world.variables.distributions import Distribution
 from scm_world.world.simulation import READ_BACK
@@ -152,6 +153,13 @@ class OurWorlds(Checkable):
         """Return the unit of a variable."""
         unit = self.model[name].unit
         return "" if unit == "1" else unit
+
+    def rounding(self) -> ArrayLike:
+        """Return how far bodies that do not touch move each number, by its value or one."""
+        world = self._world(0)
+        found = coupling(world, self.read) if world.backend is not None else {}
+        sizes = [int(np.prod(self.model[name].shape)) for name in self.read]
+        return np.repeat([found.get(name, 0.0) for name in self.read], sizes)
 
     def idle(self, name: str, *, ran: bool) -> str:
         """Return why no response is declared, or was seen of what acts in contacts alone."""

@@ -51,6 +51,7 @@ class Twins:
         self.model = compiled if isinstance(compiled, CompiledModel) else None
         # Whether the backend steps many worlds in one call:
         self.batches = engine is not None and engine.batch is not SeparateScenes
+        self.has_engine = engine is not None
         self.is_exact = engine is None or not engine.capabilities.floor
         self.scenes = None if engine is None else engine.capabilities.scenes
         self._floors: dict[str, tuple[int, list[Floats]]] = {}  # with the number of units
@@ -174,11 +175,11 @@ class Twins:
             self._floors[key] = count, largest
         return largest
 
-    def require_exact(self, question: str) -> None:
+    def require_exact(self, question: str, *, independent: bool = False) -> None:
         """Refuse a question that compares equal runs bit for bit; see ``Simulation``."""
-        if not self.is_exact:
+        if not self.is_exact or (independent and self.has_engine):
             with self.twin() as system:
-                system.require_exact(question)
+                system.require_exact(question, independent=independent)
 
     def episode(self, unit: Unit) -> Episode:
         """Run a unit in a twin."""
