@@ -182,7 +182,7 @@ class Asking:
 
     def only(self, one: Asked) -> Mask:
         """Return the mask of the world of a range."""
-        return np.arange(self.n) == one.world
+        return np.asarray(np.arange(self.n) == one.world)
 
     def run(
         self,
@@ -613,7 +613,7 @@ class Asking:
 
     @property
     def _last(self) -> Mask:
-        return np.arange(self.n) == self.n - 1
+        return np.asarray(np.arange(self.n) == self.n - 1)
 
     def _reset_last(self) -> None:
         """Reset the last world; values that change in others are kept."""
