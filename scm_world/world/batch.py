@@ -6,11 +6,12 @@ import secrets
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from inspect import signature
+from types import MappingProxyType
 from typing import Any, Literal, Self
 
 import numpy as np
 
-from scm_world._arguments import one_of, real_numbers, typed, whole_number
+from scm_world._arguments import EPISODES, one_of, real_numbers, typed, whole_number
 from scm_world._types import ArrayLike, Floats, Integers, Mask, Value
 from scm_world.backends import Backend, Capabilities, make_backend
 from scm_world.errors import (
@@ -24,6 +25,8 @@ from scm_world.errors import (
 from scm_world.graph import SCM, flatten
 from scm_world.graph.scm import request_of
 from scm_world.runs.processes import cores
+from scm_world.tasks import AnySource
+from scm_world.tasks.composition import Held, parts
 from scm_world.variables import Hard
 from scm_world.variables.distributions import word_of
 from scm_world.variables.interventions import has_times
@@ -52,6 +55,10 @@ class Batch:
         threads: Number of threads of a backend with several; the number of cores if None.
         names: Variables that are computed after every step.
 
+    Attributes:
+        names: As given; they may be replaced.
+        threads: As given.
+
     Raises:
         UnknownOption: The worlds differ in task, options or engine, or ``threads`` is not a
             positive whole number.
@@ -67,7 +74,6 @@ class Batch:
     """
 
     @typed
-    @typed
     def __init__(
         self, worlds: Sequence[Simulation], *, threads: int | None = None, names: Iterable[str] = ()
     ) -> None:
@@ -79,7 +85,7 @@ class Batch:
             raise UnknownOption("worlds", kinds, ("worlds of one task, options and engine",))
         self._set_up(given[0], given, len(given), threads, names)
         backends = [world.backend for world in given]
-        self._engine = backends[0].batch.of(backends, self._threads)
+        self._engine = backends[0].batch.of(backends, self.threads)
 
     def _set_up(
         self,
@@ -89,8 +95,8 @@ class Batch:
         threads: int | None,
         names: Iterable[str],
     ) -> None:
-        self._threads = cores() if threads is None else whole_number("threads", threads, least=1)
-        self._names, self._all = tuple(names), np.arange(n)
+        self.threads = cores() if threads is None else whole_number("threads", threads, least=1)
+        self.names, self._all = tuple(names), np.arange(n)
         self._first, self._structures = first, first.structures  # what all worlds have in common
         self._tables: dict[CompiledTask, Rows] = {}
         self._kinds: list[tuple[CompiledTask, int]] = []  # structures, and physics steps
@@ -110,15 +116,15 @@ class Batch:
         self._acts_alone = np.zeros(n, bool)
         self._origin: Snapshot | None = None  # before anything is drawn
         self._changes, self._is_closed = 0, False
-        self._options: Any = None  # of worlds that do not exist yet
-        self._make: Any = None  # makes an empty backend for one
+        self._options: Mapping[str, Any] | None = None  # of worlds that do not exist yet
+        self._make = partial(make_backend, first.backend.name)  # an empty backend for one
 
     @classmethod
     def _of(
         cls,
         kind: type[Simulation],
         num_worlds: int,
-        task: Any = "pushing",
+        task: AnySource = "pushing",
         *,
         threads: int | None = None,
         **options: Any,
@@ -148,8 +154,7 @@ class Batch:
         made = cls.__new__(cls)
         made._set_up(first, [None] * n, n, threads, names)
         made._options = {n: value for n, value in options.items() if n not in ("backend", "device")}
-        made._make = partial(make_backend, first.backend.name)
-        made._engine = first.backend.batch.made_by(made._make, n, made._threads)
+        made._engine = first.backend.batch.made_by(made._make, n, made.threads)
         return made
 
     def _alone(self, row: int) -> Simulation:
@@ -157,7 +162,7 @@ class Batch:
         world = self._worlds[row]
         if world is None:
             backend = self._engine.alone(row, self._make, is_built=bool(self._built[row]))
-            world = self._new(**self._options, backend=backend)
+            world = self._new(**(self._options or {}), backend=backend)
             done = self._done[row]
             if done is not None and self._origin is not None:
                 own = self._tables[done.compiled].row(row)
@@ -165,11 +170,16 @@ class Batch:
                 self._versions[row] = world.version
             world._closed |= self._is_closed
             self._worlds[row], self._exists[row] = world, True
-            self._done[row], self._acts_alone[row] = None, False
+            self._done[row], self._acts_alone[row] = None, world.acts_alone
         return world
 
     def _new(self, **options: Any) -> Simulation:
         return type(self._first)(self._structures, **options)
+
+    @property
+    def first(self) -> Simulation:
+        """A world like these, of which no episode has begun."""
+        return self._first
 
     def _existing(self, rows: Integers) -> list[int]:
         """List which of some worlds exist by themselves."""
@@ -188,7 +198,7 @@ class Batch:
             NotReset: No episode has begun in one of the worlds.
         """
         parts = []
-        for table, rows in self._by_structure(self._all):
+        for table, rows in self.by_structure(self._all):
             table.compiled.model.declared(name)
             table.evaluate((name,), rows)
             parts.append((table[name][rows], rows))
@@ -203,7 +213,7 @@ class Batch:
     def tensor(self, name: str) -> Any:
         """Return a state of all worlds, shape (n, size); see ``Simulation.tensor``."""
         self._require_states(self._all)
-        for table, _ in self._by_structure(self._all):
+        for table, _ in self.by_structure(self._all):
             table.compiled.model.declared(name)
         return self._engine.tensor(self._all, name)
 
@@ -217,7 +227,7 @@ class Batch:
             found[row] = self._alone(row).index
         return found
 
-    def values(self, *, where: Any = None) -> dict[str, Value]:
+    def values(self, *, where: Mask | None = None) -> dict[str, Value]:
         """Return the present values of all variables that the selected worlds have.
 
         Args:
@@ -231,7 +241,7 @@ class Batch:
         """
         rows = np.flatnonzero(read_mask("where", where, len(self)))
         found: dict[str, Value] = {}
-        for table, members in self._by_structure(rows):
+        for table, members in self.by_structure(rows):
             table.evaluate(None, members)
             common = [name for name in table.compiled.model if not found or name in found]
             there = np.searchsorted(rows, members)
@@ -246,7 +256,8 @@ class Batch:
         self,
         *,
         seed: int | Sequence[int | None] | None = None,
-        where: Any = None,
+        episode: int | Sequence[int] = 0,
+        where: Mask | None = None,
         do: Mapping[str, Any] | None = None,
         space: AnyRegion | None = None,
     ) -> Audits:
@@ -254,6 +265,7 @@ class Batch:
 
         Args:
             seed: Seed of the first world, from which the others count up; or a list of seeds.
+            episode: Number of the episode of every world with a seed, or a list of n numbers.
             where: Boolean mask of the worlds to reset, shape (n,); all if None.
             do: As in ``do``.
             space: As in ``do``.
@@ -265,48 +277,54 @@ class Batch:
             InterventionError: The intervention was refused; the message names the world. The
                 episodes of all selected worlds have begun without it.
         """
-        seeds, request = read_seeds(seed, len(self)), request_of(do)
+        seeds, numbers = read_seeds(seed, len(self)), read_numbers(episode, len(self))
+        request = request_of(do)
         rows = np.flatnonzero(read_mask("where", where, len(self)))
         there = [self._first, *map(self._alone, self._existing(rows))]
         has_context = bool(getattr(request, "context", ()))  # a plan with layers, for all alike
         planned = has_times(request) or any(getattr(world, "plan", ()) for world in there)
         if not (planned or has_context):
-            self._begin_all(rows, seeds)
+            self._begin_all(rows, seeds, numbers)
             return self._do(request, rows, space) if request else Audits({}, {})
         flat = flatten(request)
 
         def begin(row: int) -> Audit | None:
             asked = request if has_context else self._request(row, flat)
-            return self._alone(row).reset(seed=seeds[row], do=asked, space=space)
+            how = {"seed": seeds[row], "episode": numbers[row]}
+            return self._alone(row).reset(**how, do=asked, space=space)
 
         try:
             found = self._everywhere(rows, begin)
         except ScmWorldError as error:
             if not isinstance(error, EngineFailure):
-                self._everywhere(rows, lambda row: self._alone(row).reset(seed=seeds[row]))
+                self._everywhere(
+                    rows,
+                    lambda row: self._alone(row).reset(seed=seeds[row], episode=numbers[row]),
+                )
             raise
         return Audits({row: audit for row, audit in found.items() if audit is not None}, {})
 
-    def _begin_all(self, rows: Integers, seeds: Sequence[Any]) -> None:
+    def _begin_all(self, rows: Integers, seeds: Sequence[Any], numbers: Sequence[int]) -> None:
         """Begin an episode without interventions in some worlds, or in none of them."""
         back: list[Callable[[], None]] = []
-        alike = self._begins_alike()
+        alike = self.begins_alike()
         apart = [row for row in rows.tolist() if row in self._shown or not alike]
         try:
             self._everywhere(
                 np.array(apart, dtype=int),
-                lambda row: self._alone(row).reset(seed=seeds[row]),
+                lambda row: self._alone(row).reset(seed=seeds[row], episode=numbers[row]),
                 back,
             )
             if len(apart) < len(rows):
                 together = np.setdiff1d(rows, apart)
-                self._begin_together(together, [seeds[row] for row in together.tolist()], back)
+                each = [(seeds[row], numbers[row]) for row in together.tolist()]
+                self._begin_together(together, each, back)
         except BaseException:
             for undo in reversed(back):
                 undo()
             raise
 
-    def _begins_alike(self) -> bool:
+    def begins_alike(self) -> bool:
         """Return whether what is drawn at the beginning is numbers that move no body."""
         if any(variable.own_noise is not None for variable in self._structures.head.variables):
             return False
@@ -316,14 +334,17 @@ class Batch:
         return not moves and natural.composition.structural.isdisjoint(order)
 
     def _begin_together(
-        self, rows: Integers, seeds: Sequence[Any], back: list[Callable[[], None]]
+        self, rows: Integers, each: Sequence[tuple[Any, int]], back: list[Callable[[], None]]
     ) -> None:
-        """Begin an episode in worlds that begin alike; see ``Simulation._begin``."""
+        """Begin an episode in worlds that begin alike; see ``Simulation._begin``.
+
+        ``each`` has the seed and the number of the episode of each world.
+        """
         natural, engine = self._structures.natural(None), self._engine
         where, own, built = self._where[rows], list[int](), self._built[rows]
         where[:, 2] = 0
         lost = np.zeros(len(rows), bool)
-        for place, (row, seed) in enumerate(zip(rows.tolist(), seeds, strict=True)):
+        for place, (row, (seed, number)) in enumerate(zip(rows.tolist(), each, strict=True)):
             world, there = self._worlds[row], self._done[row] is not None
             if world is not None:
                 built[place] = there = world.has_begun
@@ -333,7 +354,8 @@ class Batch:
                 own.append(CompiledNoise(seed).seed)
             else:
                 own.append(self._seeds[row] if there else secrets.randbits(63))
-            where[place, 1] = where[place, 1] + np.uint64(1) if there and seed is None else 0
+            following = where[place, 1] + np.uint64(1) if there else 0
+            where[place, 1] = following if seed is None else number
         where[:, 0] = [word_of(f"seed {seed}") for seed in own]
         fresh, again, kept = rows[~built], rows[built], rows[built & ~lost]
         if kept.size:
@@ -416,7 +438,7 @@ class Batch:
         self,
         request: Mapping[str, Any],
         *,
-        where: Any = None,
+        where: Mask | None = None,
         space: AnyRegion | None = None,
         on_refusal: Literal["raise", "skip"] = "raise",
     ) -> Audits:
@@ -526,11 +548,10 @@ class Batch:
         self._place[rows] = places
         self._where[rows] = one.where[places]
         self._changes += 1
-        commands = one.compiled.composition.commands
-        if commands is not None:
-            self._acts_alone[rows] = commands.applies(Rows(one.compiled, table.numbers[rows]))
-        if self._names:
-            table.evaluate(self._names, rows)
+        commands, now = one.compiled.composition.commands, Rows(one.compiled, table.numbers[rows])
+        self._acts_alone[rows] = commands is not None and commands.applies(now)
+        if self.names:
+            table.evaluate(self.names, rows)
 
     def _write(
         self, one: SharedTransaction, members: Integers, table: Rows, back: list[Callable[[], None]]
@@ -621,7 +642,7 @@ class Batch:
                 raise
         return found
 
-    def step(self, actions: ArrayLike, *, where: Any = None) -> None:
+    def step(self, actions: ArrayLike, *, where: Mask | None = None) -> None:
         """Advance some worlds one control step.
 
         Args:
@@ -668,16 +689,25 @@ class Batch:
     def table(self, index: int) -> Rows:
         """Return the rows of all worlds with the structure of one world."""
         index = self._numbered(index)
-        return self._by_structure(self._all[index : index + 1])[0][0]
+        return self.by_structure(self._all[index : index + 1])[0][0]
 
-    def _by_structure(self, rows: Integers) -> list[tuple[Rows, Integers]]:
+    def by_structure(self, rows: Integers) -> list[tuple[Rows, Integers]]:
         """Return the rows of some worlds by structure, with the numbers of these worlds."""
         return [(self._tables[kind[0]], members) for kind, members in self._groups(rows)]
 
-    def advance(self, commands: Floats, which: Mask | None = None) -> None:
-        """Advance worlds one control step, all if ``which`` is None; see ``Simulation.advance``.
+    def advance(
+        self,
+        commands: Floats,
+        which: Mask | None = None,
+        within: Mapping[int, Floats] = MappingProxyType({}),
+    ) -> None:
+        """Advance worlds one control step; see ``Simulation.advance``.
 
-        Commands are finite numbers within the bounds, shape (n, n_actions).
+        Args:
+            commands: Finite numbers within the bounds, shape (n, n_actions).
+            which: The worlds; all if None.
+            within: By number of a world, what acts in each physics step in place of its command,
+                shape (substeps, n_actions).
 
         Raises:
             NotReset: No episode has begun in one of the worlds.
@@ -688,20 +718,12 @@ class Batch:
         rows = self._all if which is None else np.flatnonzero(which)
         self._require_states(rows)
         groups, sent = self._groups(rows), commands
-        held: dict[int, Floats] = {}
-        there: Any = self._worlds
-        alone = [row for row in self._existing(rows) if there[row].acts_alone]
-        alone += rows[self._acts_alone[rows]].tolist()
+        held: dict[int, Held] = {}
+        late: Mapping[int, Floats] = within
+        alone = rows[self._acts_alone[rows]].tolist()
         if alone:
-            commands = commands.copy()
-            sent = np.zeros((len(self), self._first.structure.n_commands))
             others = np.setdiff1d(rows, alone)
-            if others.size:  # none, and a row of commands may be of another size
-                sent[others] = commands[others]
-            for row in alone:
-                commands[row], sent[row], numbers = self._decided(row, commands[row])
-                if numbers is not None:
-                    held[row] = numbers
+            commands, sent, late, held = self._decide(alone, others, commands, within)
         failed: EngineFailure | None = None
         for (compiled, substeps), members in groups:
             table = self._tables[compiled]
@@ -709,7 +731,7 @@ class Batch:
             kept = table.numbers[members if self._engine.may_refuse else members[:0]]
             table.advance(commands, members)
             try:
-                self._engine.step(members, sent, substeps, table.numbers)
+                self._step(members, sent, late, held, substeps, table.numbers)
             except BaseException as error:  # or Ctrl-C: the others were stepped
                 unmoved = error.unmoved if isinstance(error, EngineFailure) else ()
                 for place, row in enumerate(members.tolist()):
@@ -726,14 +748,67 @@ class Batch:
             finally:
                 for row in members.tolist() if held else ():
                     if row in held:
-                        there = slice(compiled.state_size - held[row].size, compiled.state_size)
-                        table.numbers[row, there] = held[row]
+                        numbers, size = held[row].numbers, compiled.state_size
+                        table.numbers[row, size - numbers.size : size] = numbers
         if failed is not None:
             raise failed
         for (compiled, _), members in groups:
-            self._tables[compiled].evaluate(self._names, members)
+            self._tables[compiled].evaluate(self.names, members)
 
-    def _decided(self, row: int, action: Floats) -> tuple[Floats, Floats, Floats | None]:
+    def _decide(
+        self, alone: list[int], others: Integers, commands: Floats, within: Mapping[int, Floats]
+    ) -> tuple[Floats, Floats, dict[int, Floats], dict[int, Held]]:
+        """Return actions, commands, those of each physics step, and what worlds keep; see above."""
+        commands, late, held = commands.copy(), dict(within), dict[int, Held]()
+        sent = np.zeros((len(self), self._first.structure.n_commands))
+        if others.size:  # none, and a row of commands may be of another size
+            sent[others] = commands[others]
+        for row in alone:
+            if row in within:
+                now = [self._decided(row, one)[1].copy() for one in within[row]]
+                late[row] = np.array([c if c.ndim == 1 else c[i] for i, c in enumerate(now)])
+            commands[row], found, after = self._decided(row, commands[row])
+            if found.ndim > 1:
+                late.setdefault(row, found.copy())
+            sent[row] = found if found.ndim == 1 else found[-1]
+            if after is not None:
+                held[row] = after
+        return commands, sent, late, held
+
+    def _step(
+        self,
+        members: Integers,
+        sent: Floats,
+        late: Mapping[int, Floats],
+        held: Mapping[int, Held],
+        substeps: int,
+        into: Floats,
+    ) -> None:
+        """Step the engine, part by part where commands change within the control step."""
+        mine = [row for row in members.tolist() if row in late] if late else []
+        if not mine:
+            self._engine.step(members, sent, substeps, into)
+            return
+        each = np.repeat(sent[None], substeps, axis=0)
+        each[:, mine] = np.stack([late[row] for row in mine], axis=1)
+        going, done, failed = members, 0, None
+        samples = {step for row in mine if row in held for step in held[row].samples}
+        for steps, part in parts(each, samples):
+            try:
+                self._engine.step(going, part, steps, into)
+            except EngineFailure as error:
+                if done:  # the control step was taken in part
+                    error.lost, error.unmoved = (*error.lost, *error.unmoved), ()
+                going = np.setdiff1d(going, (*error.lost, *error.unmoved))
+                failed = error.after(failed)
+            done += steps
+            for row in going.tolist() if done in samples else ():
+                if row in held:
+                    held[row].see(done, into[row])
+        if failed is not None:
+            raise failed
+
+    def _decided(self, row: int, action: Floats) -> tuple[Floats, Floats, Held | None]:
         """Compute what a control step does with an action; see ``Simulation._decided``."""
         world, done = self._worlds[row], self._done[row]
         if world is not None or done is None:
@@ -742,7 +817,7 @@ class Batch:
         key.step = int(own.numbers[done.compiled.clock])
         state = own.numbers[: done.compiled.state_size]
         commands: Any = done.compiled.composition.commands
-        given = action, own, state, key
+        given = action, own, state, key, self._kinds[self._kind[row]][1]
         return action, commands.command(*given), commands.held(*given)
 
     def _require_states(self, rows: Integers) -> None:
@@ -761,7 +836,7 @@ class Batch:
             self._fill(row)
         if changed:
             for (compiled, _), members in self._by_kind(np.array(changed)):
-                self._tables[compiled].evaluate(self._names, members)
+                self._tables[compiled].evaluate(self.names, members)
             for row in changed:
                 self._versions[row] = there[row].version
         return self._by_kind(rows)
@@ -779,6 +854,7 @@ class Batch:
         world = self._alone(row)
         world._require_episode()
         self._kind[row] = self._number((world.compiled, world.substeps))
+        self._acts_alone[row] = world.acts_alone
         table = self._tables[world.compiled]
         if world.row.numbers.base is not table.numbers:
             world.move(table.row(row))
@@ -806,10 +882,10 @@ class Batch:
     def __reduce__(self) -> tuple[Any, ...]:
         """Return the parts for copying and pickling."""
         if self._options is None:
-            return partial(type(self), threads=self._threads, names=self._names), (self._worlds,)
+            return partial(type(self), threads=self.threads, names=self.names), (self._worlds,)
         begun = {row: self._alone(row) for row in np.flatnonzero(self._kind >= 0).tolist()}
         saved = {row: world.snapshot() for row, world in begun.items() if world.has_begun}
-        given = self._options, len(self), self._threads, self._names
+        given = self._options, len(self), self.threads, self.names
         return _copied, (type(self), saved, self._first, *given)
 
     def close(self) -> None:
@@ -838,7 +914,7 @@ def located(error: ScmWorldError, index: int, what: str) -> ScmWorldError:
     return error
 
 
-def read_seeds(seed: Any, size: int) -> list[Any]:
+def read_seeds(seed: object, size: int) -> list[Any]:
     """Return the seed of each world; one seed counts up."""
     if seed is None:
         return [None] * size
@@ -848,6 +924,14 @@ def read_seeds(seed: Any, size: int) -> list[Any]:
     if len(seed) != size:
         raise UnknownOption("seed", seed, ("a whole number", f"a list of {size} of them or None"))
     return [*seed]
+
+
+def read_numbers(episode: Any, size: int) -> list[int]:
+    """Return the number of the episode of each world; one number is that of all."""
+    each = [*episode] if np.ndim(episode) else [episode] * size
+    if len(each) != size:
+        raise UnknownOption("episode", episode, ("a whole number", f"a list of {size} of them"))
+    return [whole_number("episode", number, least=0, most=EPISODES) for number in each]
 
 
 def values_of_each(model: SCM, request: Mapping[str, Any], count: int) -> dict[str, Any]:
@@ -873,18 +957,20 @@ def of_row(
     return found
 
 
-def read_mask(name: str, mask: Any, size: int) -> Mask:
+def read_mask(name: str, mask: object, size: int) -> Mask:
     """Return a checked boolean mask of worlds; all if None."""
     if mask is None:
         return np.ones(size, bool)
-    read = isinstance(mask, np.ndarray) and mask.shape == (size,) and mask.dtype == np.bool_
-    if not (read and mask.any()):
+    is_array = isinstance(mask, np.ndarray) and mask.dtype == np.bool_ and mask.shape == (size,)
+    if not is_array or not np.asarray(mask).any():
         allowed = (f"an array of {size} truth values, at least one of them true",)
         raise UnknownOption(name, mask, allowed)
     return np.array(mask)
 
 
-def read_actions(actions: Any, which: Mask | None, shape: tuple[int, int], what: str) -> Floats:
+def read_actions(
+    actions: ArrayLike, which: Mask | None, shape: tuple[int, int], what: str
+) -> Floats:
     """Return the checked actions of all worlds, of which ``which`` are stepped, in a shape.
 
     A world is called ``what`` in errors.

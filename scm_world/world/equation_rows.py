@@ -24,6 +24,7 @@ from scm_world.world.batch import (
     of_row,
     read_actions,
     read_mask,
+    read_numbers,
     read_seeds,
     values_of_each,
 )
@@ -84,7 +85,7 @@ class EquationBatch:
         """
         return self._gathered((self._one.model.declared(name).name,), self._all)[name]
 
-    def values(self, *, where: Any = None) -> dict[str, Value]:
+    def values(self, *, where: Mask | None = None) -> dict[str, Value]:
         """Return the present values of all variables in the selected worlds; see ``Batch``."""
         rows = np.flatnonzero(read_mask("where", where, len(self)))
         return self._gathered(tuple(self._one.model), rows)
@@ -137,20 +138,22 @@ class EquationBatch:
         self,
         *,
         seed: int | Sequence[int | None] | None = None,
-        where: Any = None,
+        episode: int | Sequence[int] = 0,
+        where: Mask | None = None,
         do: Mapping[str, Any] | None = None,
         space: AnyRegion | None = None,
     ) -> Audits:
         """Begin an episode in all selected worlds; see ``Batch.reset``."""
         mask, request = read_mask("where", where, len(self)), request_of(do)
-        seeds, numbers = read_seeds(seed, len(self)), np.zeros(len(self), dtype=np.uint64)
+        seeds = read_seeds(seed, len(self))
+        numbers = np.array(read_numbers(episode, len(self)), dtype=np.uint64)
         for part, members in self._parts if any(one is None for one in seeds) else ():
             now = zip(members.tolist(), part.seeds, np.ravel(part.episode), strict=True)
             for row, old, number in now:
                 if seeds[row] is None and part.has_begun:
                     seeds[row], numbers[row] = old, number + 1
                 elif seeds[row] is None:
-                    seeds[row] = secrets.randbits(63)
+                    seeds[row], numbers[row] = secrets.randbits(63), 0
 
         def begin(asked: Mapping[str, Any]) -> Callable[[Equations, Integers], Audit | None]:
             def act(part: Equations, members: Integers) -> Audit | None:
@@ -171,7 +174,7 @@ class EquationBatch:
         self,
         request: Mapping[str, Any],
         *,
-        where: Any = None,
+        where: Mask | None = None,
         space: AnyRegion | None = None,
         on_refusal: Literal["raise", "skip"] = "raise",
     ) -> Audits:
@@ -184,7 +187,7 @@ class EquationBatch:
         mask = read_mask("where", where, len(self))
         return self._change(mask, act, request_of(request), skips=on_refusal == "skip")
 
-    def step(self, actions: ArrayLike, *, where: Any = None) -> None:
+    def step(self, actions: ArrayLike, *, where: Mask | None = None) -> None:
         """Advance some worlds one control step.
 
         Args:
@@ -424,7 +427,7 @@ class EquationTable:
         found: Mask = (versions == self._versions) & (indices == known)
         return found
 
-    def _by_structure(self, rows: Integers) -> list[tuple[Rows, Integers]]:
+    def by_structure(self, rows: Integers) -> list[tuple[Rows, Integers]]:
         """Return the rows of all worlds, and the numbers of some of them."""
         if not len(rows):
             return []

@@ -199,7 +199,7 @@ def test_order_shards_and_workers_do_not_matter(world: World) -> None:
     assert collect(world, design, 7, seed=1, **how) == whole.first(7)
     with pytest.raises(UnknownOption, match="any whole number from"):
         whole.first(-1)
-    with pytest.raises(UnknownOption, match="at most 100,000,000 in files"):
+    with pytest.raises(UnknownOption, match="at most 512,000,000 in files"):
         collect(world, design, 10**30)
     assert collect(world, design, 12, seed=2, **how) != whole
 
