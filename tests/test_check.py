@@ -806,7 +806,7 @@ def test_a_report_is_read_back() -> None:
         (Pendulums, MASS),
         (Pendulums(), None),
         (Pendulums(), {}),
-        (Pendulums(), {"length": (0.0, 1.0)}),
+        (Pendulums(), {"lenght": (0.0, 1.0)}),
         (Pendulums(), {"mass": (1.0,)}),
         (Pendulums(), {"mass": (2.0, 1.0)}),
         (Pendulums(), {"mass": (1.0, 1.0)}),

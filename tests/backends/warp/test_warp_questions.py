@@ -71,7 +71,7 @@ def test_what_bodies_that_do_not_touch_change_is_no_response() -> None:
 
 def test_a_smaller_response_than_rounding_is_not_seen() -> None:
     """It is not asked, and the answer says why; MuJoCo sees it."""
-    ranges = {"gravity": ((0.0, 0.0, -9.81), (0.0, 0.0, -9.809999))}
+    ranges = {"gravity": ((0.0, 0.0, -9.81), (0.0, 0.0, -9.8099))}
     found = {}
     for backend in ("warp:cpu", "mujoco"):
         with World("pushing", backend=backend, num_worlds=2) as worlds:
