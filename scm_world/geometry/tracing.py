@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import builtins
 import math
+import operator
 from collections.abc import Callable, Iterable
 from functools import cache, partial
 from types import FunctionType, SimpleNamespace
@@ -265,3 +266,66 @@ def _called(function: Any, *arguments: Any) -> Any:
     symbol = next((part for part in parts if isinstance(part, Symbol)), None)
     made = _over_symbols(function)
     return made(*arguments) if symbol is None else symbol.trace.inner(made, [*arguments])
+
+
+# --- on columns -----------------------------------------------------------------------------------
+
+
+@final
+class Expressions:
+    """Operations of a trace that write some columns.
+
+    Args:
+        trace: The operations.
+        results: What is written, by column: symbols and numbers.
+        torch: The library.
+    """
+
+    def __init__(self, trace: Trace, results: dict[int, Any], torch: Any) -> None:
+        used, stack = set[int](), [one.node for one in results.values() if type(one) is Symbol]
+        while stack:
+            node = stack.pop()
+            if node not in used:
+                used.add(node)
+                stack += [one for one in trace.nodes[node][1:] if type(one) is int]
+        self._torch = torch
+        self._given = [
+            (number, node[1][0])
+            for number, node in enumerate(trace.nodes)
+            if number in used and node[0] == "column"
+        ]
+        self._steps = [
+            (number, _operation(torch, node[0]), node[1:])
+            for number, node in enumerate(trace.nodes)
+            if number in used and node[0] != "column"
+        ]
+        self._to = [*results]
+        self._from = [one.node if type(one) is Symbol else (float(one),) for one in results.values()]
+        self._size = len(trace.nodes)
+
+    def __call__(self, table: Any) -> None:
+        """Compute columns of a table, shape (width, n), and write them."""
+        values: list[Any] = [None] * self._size
+        for number, place in self._given:
+            values[number] = table[place]
+        for number, operation, given in self._steps:
+            arguments = [values[one] if type(one) is int else one[0] for one in given]
+            values[number] = operation(*arguments)
+        found = [
+            values[one] if type(one) is int else table.new_full(table.shape[1:], one[0])
+            for one in self._from
+        ]
+        if found:
+            table[self._to] = self._torch.stack(found).to(table.dtype)
+
+
+def _operation(torch: Any, name: str) -> Callable[..., Any]:
+    function: Callable[..., Any] = getattr(operator, name, None) or getattr(torch, name)
+    if name not in ("minimum", "maximum", "atan2"):
+        return function
+
+    def of_tensors(a: Any, b: Any) -> Any:
+        like = a if torch.is_tensor(a) else b
+        return function(*(x if torch.is_tensor(x) else like.new_tensor(x) for x in (a, b)))
+
+    return of_tensors

@@ -2,78 +2,18 @@
 
 from __future__ import annotations
 
-import operator
-from collections.abc import Callable, Iterable
+from collections import Counter
+from collections.abc import Iterable
 from typing import Any, final
 
 import numpy as np
 
 from scm_world._arguments import load
 from scm_world._types import Integers
-from scm_world.geometry.tracing import Symbol, Trace, Untraceable
+from scm_world.geometry.tracing import Expressions, Symbol, Trace, Untraceable
 from scm_world.world.compiled_task import CompiledTask
 from scm_world.world.kernels import run
 from scm_world.world.mechanisms import PythonStep, Rows, Step, places, program_of
-
-
-@final
-class Expressions:
-    """Operations of a trace that write some columns.
-
-    Args:
-        trace: The operations.
-        results: What is written, by column: symbols and numbers.
-        torch: The library.
-    """
-
-    def __init__(self, trace: Trace, results: dict[int, Any], torch: Any) -> None:
-        used, stack = set[int](), [one.node for one in results.values() if type(one) is Symbol]
-        while stack:
-            node = stack.pop()
-            if node not in used:
-                used.add(node)
-                stack += [one for one in trace.nodes[node][1:] if type(one) is int]
-        self._torch = torch
-        self._given = [
-            (number, node[1][0])
-            for number, node in enumerate(trace.nodes)
-            if number in used and node[0] == "column"
-        ]
-        self._steps = [
-            (number, _operation(torch, node[0]), node[1:])
-            for number, node in enumerate(trace.nodes)
-            if number in used and node[0] != "column"
-        ]
-        self._to = [*results]
-        self._from = [one.node if type(one) is Symbol else (float(one),) for one in results.values()]
-        self._size = len(trace.nodes)
-
-    def __call__(self, table: Any) -> None:
-        """Compute columns of a table, shape (width, n), and write them."""
-        values: list[Any] = [None] * self._size
-        for number, place in self._given:
-            values[number] = table[place]
-        for number, operation, given in self._steps:
-            arguments = [values[one] if type(one) is int else one[0] for one in given]
-            values[number] = operation(*arguments)
-        found = [
-            values[one] if type(one) is int else table.new_full(table.shape[1:], one[0])
-            for one in self._from
-        ]
-        if found:
-            table[self._to] = self._torch.stack(found).to(table.dtype)
-
-
-def _operation(torch: Any, name: str) -> Callable[..., Any]:
-    function: Callable[..., Any] = getattr(operator, name, None) or getattr(torch, name)
-    if name not in ("minimum", "maximum", "atan2"):
-        return function
-
-    def of_tensors(a: Any, b: Any) -> Any:
-        like = a if torch.is_tensor(a) else b
-        return function(*(x if torch.is_tensor(x) else like.new_tensor(x) for x in (a, b)))
-
-    return of_tensors
 
 
 @final
@@ -87,18 +27,20 @@ class TensorRows:
         rows: The rows on the host, of which every column is up to date.
         names: Variables to compute.
         device: Of torch.
+        copies: Counts bytes that are copied.
 
     Attributes:
         table: The values, shape (width, n), 64-bit.
         on_host: The variables that are computed on the host.
-        copied: Number of bytes that ``evaluate`` has copied, by direction.
     """
 
-    def __init__(self, rows: Rows, names: Iterable[str], device: str) -> None:
+    def __init__(
+        self, rows: Rows, names: Iterable[str], device: str, copies: Counter[str]
+    ) -> None:
         torch = load("torch", "torch", "train")
         self._torch, self._rows, self._device = torch, rows, device
         self.table = torch.as_tensor(rows.numbers.T.copy(), device=device)
-        self.copied = {"to the host": 0, "to the device": 0}
+        self._copies = copies
         compiled = rows.compiled
         self._parts, self.on_host = _parts(compiled, names, torch)
         memory = compiled.stepped[2:]
@@ -124,8 +66,8 @@ class TensorRows:
                 step(numbers, self._all)
         found = np.ascontiguousarray(numbers[:, outputs].T)
         self.table[outputs] = self._torch.as_tensor(found, device=self._device)
-        self.copied["to the host"] += given.nbytes
-        self.copied["to the device"] += found.nbytes
+        self._copies["mechanisms to the host"] += given.nbytes
+        self._copies["mechanisms to the device"] += found.nbytes
 
     def begin_step(self, commands: Any) -> None:
         """Begin a control step: remember, take commands, shape (n_actions, n), move the clock."""
@@ -138,13 +80,13 @@ class TensorRows:
         """Write the values of some worlds into the rows on the host."""
         found = self.table[:, which].cpu().numpy()
         self._rows.numbers[which] = found.T
-        self.copied["to the host"] += found.nbytes
+        self._copies["episodes to the host"] += found.nbytes
 
     def to_device(self, which: Integers) -> None:
         """Read the values of some worlds from the rows on the host."""
         found = np.ascontiguousarray(self._rows.numbers[which].T)
         self.table[:, which] = self._torch.as_tensor(found, device=self._device)
-        self.copied["to the device"] += found.nbytes
+        self._copies["episodes to the device"] += found.nbytes
 
 
 def _parts(compiled: CompiledTask, names: Iterable[str], torch: Any) -> tuple[list[Any], list[str]]:
@@ -168,7 +110,7 @@ def _parts(compiled: CompiledTask, names: Iterable[str], torch: Any) -> tuple[li
             trace, now = Trace(), dict(constants)
             reads, writes = (np.concatenate(side) for side in zip(*map(_touched, steps)))
             moving = np.setdiff1d(reads, [*constants, *places(static), *writes])
-            parts.append((moving, program_of(steps), writes))
+            parts.append((moving, program_of(steps), places([compiled.where[name]])))
     parts.append(Expressions(trace, now, torch))
     return parts, on_host
 
