@@ -7,9 +7,11 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple, final
 
 import numpy as np
+from gymnasium.vector import VectorEnv
 
 from scm_world._arguments import load
 from scm_world._types import Integers, Mask
+from scm_world.backends import Scenes
 from scm_world.env.actions import JOINTS
 from scm_world.env.batch import ScmWorldVectorEnv
 from scm_world.env.observer import FAILED
@@ -44,6 +46,43 @@ class TensorStep(NamedTuple):
     rows: Integers
     last: Any
     facts: Mapping[str, Any]
+
+
+@final
+class HostEnvs:
+    """The same for environments that are stepped on the host, whatever their engine is."""
+
+    why_not, on_host = "", ()
+
+    def __init__(self, envs: VectorEnv[Any, Any, Any], seen: Any) -> None:
+        self._torch, self._envs = load("torch", "torch", "train"), envs
+        self.seen = self._torch.as_tensor(seen)
+
+    def step(self, actions: Any) -> TensorStep:
+        """Advance all environments a control step; see ``TensorEnvs.step``."""
+        seen, *flags, infos = self._envs.step(actions.cpu().numpy())
+        rewards, terminated, truncated = map(self._torch.as_tensor, flags)
+        self.seen = self._torch.as_tensor(seen)
+        rows = np.flatnonzero(flags[1] | flags[2])
+        last, facts = self.seen[rows], {FAILED: np.zeros(len(rows), bool)}
+        if len(rows):
+            last = self._torch.as_tensor(np.stack([*infos["final_obs"][rows]]))
+            about = infos["final_info"]
+            facts |= {n: about[n][rows] for n in (SUCCESS, FRACTION, FAILED) if n in about}
+        return TensorStep(self.seen, rewards, terminated, truncated, rows, last, facts)
+
+    def reset(self, which: Mask) -> None:
+        """Begin an episode in some environments."""
+        self.seen = self._torch.as_tensor(self._envs.reset(options={"reset_mask": which})[0])
+
+    def leave(self) -> None:
+        """Do nothing: the environments are up to date."""
+
+
+def has_device(envs: Any) -> bool:
+    """Return whether the engine of environments has states on a device."""
+    batch = getattr(envs, "_batch", None)
+    return batch is not None and type(batch._engine).resident is not Scenes.resident
 
 
 @final
@@ -151,7 +190,7 @@ class TensorEnvs:
             ModelError: A reward is not finite; the message names the environment.
         """
         torch, rows, table = self._torch, self._rows, self._rows.table
-        given, how = actions.double(), self._actions
+        given, how = actions.to(table.device, torch.float64), self._actions
         if how.relative:
             given = how.moved(given, self._origin.T)
         summand, factor, low, high = how.scale
