@@ -15,12 +15,14 @@ from scm_world.backends import Scenes
 from scm_world.env.actions import JOINTS
 from scm_world.env.batch import ScmWorldVectorEnv
 from scm_world.env.observer import FAILED
-from scm_world.env.vector import Vector
+from scm_world.env.vector import STREAM, Vector
 from scm_world.errors import EngineFailure, ScmWorldError
 from scm_world.tasks.model import REWARD
 from scm_world.tasks.rewards import FRACTION, one_number
+from scm_world.variables import Normal
 from scm_world.variables.reserved import SENSOR_NOISE
 from scm_world.world.batch import located
+from scm_world.world.philox import uniforms, words_of
 from scm_world.world.tensors import TensorRows
 
 SUCCESS = "is_success"
@@ -138,6 +140,17 @@ class TensorEnvs:
         self._origin_at = self._commands if reads is None else where[reads]
         put = reads is None and lead.world.options.action_mode == JOINTS
         self._put_at = where[JOINTS] if put and lead.actions.relative else None
+        sizes = {STREAM: len(vector.space.low)}
+        columns = {STREAM: where[SENSOR_NOISE]} if SENSOR_NOISE in where else {}
+        commands = compiled.composition.commands
+        self._sent = ""
+        if commands is not None and commands.added is not None:
+            scaled, self._sent, spread = commands.added
+            columns[self._sent], sizes[self._sent] = where[scaled], len(spread)
+            self._spread = made(spread[:, None])
+        # Of each stream of noise: the column of its scale, how many numbers, whether there is any.
+        self._noises = {n: [at.start, sizes[n], False] for n, at in columns.items()}
+        self._where = np.zeros((envs.num_envs, 3), dtype=np.uint64)  # see ``uniforms``
         self._look(self._all)
 
     @property
@@ -158,27 +171,47 @@ class TensorEnvs:
         if not isinstance(part, Vector) or part.on_columns(np.asarray) is None:
             return "observations are pictures, views of hands, or the predecessor's"
         compiled, worlds = kinds[0][0][0], [envs._inner[row].world for row in rows.tolist()]
-        if any(world.acts_alone for world in worlds):
-            return "actuators have noise, fingertips are commanded, or actions are held"
+        commands = compiled.composition.commands
+        alone = commands is not None and commands.added is None
+        if any(world.acts_alone and (alone or world.holds_actions) for world in worlds):
+            return "commands are computed from states, or actions are held"
         if any(world.is_planned and world.plan_end > 0.0 for world in worlds):
             return "interventions are planned within episodes"
-        numbers = envs._batch._tables[compiled].numbers
-        noise = compiled.where.get(SENSOR_NOISE)
-        if noise is not None and numbers[rows, noise.start].any():
-            return "sensors have noise"
         return ""
 
     def _look(self, rows: Integers) -> None:
         """Observe environments of which an episode has begun, and where their actions begin."""
         table, actions = self._rows.table, self._rows.table[self._origin_at]
+        for row in rows.tolist():
+            world = self._envs._inner[row].world
+            key = world.noise_key(world.index)
+            self._where[row] = key.noise.key, key.episode, key.step
+        numbers = self._envs._batch._tables[self._kinds[0][0][0]].numbers
+        for noise in self._noises.values():
+            noise[2] = bool(numbers[:, noise[0]].any())
+        seen = self._observe(table[:, rows], self._drawn(STREAM, rows)).float()
         if len(rows) == len(self._all):
-            self.seen, self._origin = self._observe(table).float(), actions.clone()
+            self.seen, self._origin = seen, actions.clone()
         else:
-            self.seen[rows] = self._observe(table[:, rows]).float()
+            self.seen[rows] = seen
             self._origin[:, rows] = actions[:, rows]
         if self._put_at is not None:
             put = [row for row in rows.tolist() if self._envs._inner[row].actions.is_set()]
             self._origin[:, put] = table[self._put_at][:, put]
+
+    def _drawn(self, stream: str, rows: Integers) -> Any:
+        """Draw normal numbers of some environments at this step, shape (m, k); None without noise.
+
+        They are drawn on the host, as ``NoiseKey.draw`` does in each of them.
+        """
+        _, size, is_there = self._noises.get(stream, (0, 0, False))
+        if not is_there:
+            return None
+        normal, words = Normal(), words_of(stream, None, range(1))
+        numbers = uniforms(self._where[rows], words, normal.n_uniforms((size,)))[:, 0]
+        drawn = np.asarray(normal.transform(numbers, (size,), {}))
+        self.copies["noise to the device"] += drawn.nbytes
+        return self._torch.as_tensor(drawn, device=self._rows.table.device)
 
     def step(self, actions: Any) -> TensorStep:
         """Advance all environments a control step; episodes that are over begin anew.
@@ -195,7 +228,10 @@ class TensorEnvs:
             given = how.moved(given, self._origin.T)
         summand, factor, low, high = how.scale
         commands = (summand + factor * given).clip(low, high).T
-        reasons = self._engine.step(commands, self._substeps)
+        sent, drawn = commands, self._drawn(self._sent, self._all)
+        if drawn is not None:
+            sent = commands + table[self._noises[self._sent][0]] * self._spread * drawn.T
+        reasons = self._engine.step(sent, self._substeps)
         failed = torch.tensor([*reasons], dtype=torch.int64, device=table.device)
         before = table[:, failed]
         rows.begin_step(commands)
@@ -209,7 +245,8 @@ class TensorEnvs:
             terminated = table[self._ended] != 0.0
         truncated = table[self._clock] >= self._limit
         rewards[failed], terminated[failed], truncated[failed] = 0.0, False, True
-        self.seen = self._observe(table).float()
+        self._where[np.setdiff1d(self._all, [*reasons]), 2] += np.uint64(1)
+        self.seen = self._observe(table, self._drawn(STREAM, self._all)).float()
         over, sound = terminated | truncated, rewards.isfinite()
         flags = torch.stack([over.any(), ~sound.all()])
         self.copies["flags to the host"] += flags.nbytes

@@ -209,8 +209,10 @@ class Vector:
             raw = raw + noise * self._spread * drawn
         return self._of(raw)
 
-    def on_columns(self, made: Callable[[Floats], Any]) -> Callable[[Any], Any] | None:
+    def on_columns(self, made: Callable[[Floats], Any]) -> Callable[..., Any] | None:
         """Return what observes columns of values, shape (width, n), as an array (n, k).
+
+        It takes the numbers that the noise of the sensors scales, too, shape (n, k).
 
         None if that cannot be: a view of a hand, or the signs of the predecessor's quaternions.
 
@@ -223,10 +225,13 @@ class Vector:
         low, high, gain, offset, more = (
             made(one[:, None]) for one in (*self._scales[:4], shifts)
         )
-        where = self._scales[5].astype(int)
+        where, spread = self._scales[5].astype(int), made(self._spread[:, None])
 
-        def observe(table: Any) -> Any:
-            return (((table[where] + more).clip(low, high) * gain + offset)).T
+        def observe(table: Any, drawn: Any = None) -> Any:
+            raw = table[where] + more
+            if drawn is not None:
+                raw = raw + table[self._noise] * spread * drawn.T
+            return (raw.clip(low, high) * gain + offset).T
 
         return observe
 

@@ -652,7 +652,8 @@ class Simulation(CausalSystem):
     def _adopt_model(self, model: SCM) -> None:
         self.graph, held = model, model.interventions
         self._held_actions = tuple(name for name in self.compiled.actions if name in held)
-        self.acts_alone = self._translates or bool(self._held_actions)
+        self.holds_actions = bool(self._held_actions)
+        self.acts_alone = self._translates or self.holds_actions
         roots = [model._applied(name, held[name]).root for name in self._held_actions]
         self._inputs = tuple(p.name for of in roots for p in of.intervention.follows(of.requested))
 
