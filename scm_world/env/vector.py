@@ -222,9 +222,7 @@ class Vector:
         if self._turns or self._view is not None:
             return None
         shifts = np.where(self._scales[4] == 0.0, -0.0, self._scales[4])  # it changes no zero
-        low, high, gain, offset, more = (
-            made(one[:, None]) for one in (*self._scales[:4], shifts)
-        )
+        low, high, gain, offset, more = (made(one[:, None]) for one in (*self._scales[:4], shifts))
         where, spread = self._scales[5].astype(int), made(self._spread[:, None])
 
         def observe(table: Any, drawn: Any = None) -> Any:

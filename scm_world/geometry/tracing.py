@@ -26,7 +26,7 @@ MOST_QUESTIONS, MOST_RUNS = 12, 300
 _PACKAGE = __name__.partition(".")[0]
 
 
-class Untraceable(Exception):  # noqa: N818 # it is an answer, which the caller expects
+class Untraceable(Exception):
     """A function does more with its arguments than arithmetic and a few decisions."""
 
 
@@ -70,7 +70,7 @@ class Symbol:
     __mul__, __rmul__ = _binary("mul"), _binary("mul", swapped=True)
     __truediv__, __rtruediv__ = _binary("truediv"), _binary("truediv", swapped=True)
     __lt__, __le__, __gt__, __ge__ = map(_binary, ("lt", "le", "gt", "ge"))
-    __eq__, __ne__ = _binary("eq"), _binary("ne")  # type: ignore[assignment]
+    __eq__, __ne__ = _binary("eq"), _binary("ne")
     __neg__, __abs__, sqrt, sin, cos, exp = map(_unary, ("neg", "abs", "sqrt", "sin", "cos", "exp"))
     arctan2 = _binary("atan2")
 
@@ -202,6 +202,12 @@ def _as_it_is(value: Any) -> Any:
     return value if isinstance(value, Symbol) else float(value)
 
 
+def _asked_for_kind(value: Any, *others: Any) -> Any:
+    if isinstance(value, Symbol):
+        raise Untraceable("it asks what kind a value is of")
+    return isinstance(value, *others)
+
+
 def _whole(value: Any) -> Any:
     if not isinstance(value, Symbol):
         return int(value)
@@ -230,6 +236,7 @@ _BUILTINS = {
     "max": _least("maximum", max),
     "float": _as_it_is,
     "int": _whole,
+    "isinstance": _asked_for_kind,
 }
 
 
@@ -290,7 +297,7 @@ class Expressions:
                 stack += [one for one in trace.nodes[node][1:] if type(one) is int]
         self._torch = torch
         self._given = [
-            (number, node[1][0])
+            (number, int(node[1][0]))
             for number, node in enumerate(trace.nodes)
             if number in used and node[0] == "column"
         ]
@@ -300,7 +307,9 @@ class Expressions:
             if number in used and node[0] != "column"
         ]
         self._to = [*results]
-        self._from = [one.node if type(one) is Symbol else (float(one),) for one in results.values()]
+        self._from: list[Any] = [
+            one.node if type(one) is Symbol else (float(one),) for one in results.values()
+        ]
         self._size = len(trace.nodes)
 
     def __call__(self, table: Any) -> None:
@@ -321,11 +330,14 @@ class Expressions:
 
 def _operation(torch: Any, name: str) -> Callable[..., Any]:
     function: Callable[..., Any] = getattr(operator, name, None) or getattr(torch, name)
-    if name not in ("minimum", "maximum", "atan2"):
+    if name not in ("minimum", "maximum", "atan2", "where"):
         return function
 
-    def of_tensors(a: Any, b: Any) -> Any:
-        like = a if torch.is_tensor(a) else b
-        return function(*(x if torch.is_tensor(x) else like.new_tensor(x) for x in (a, b)))
+    def of_tensors(*given: Any) -> Any:  # which do not take numbers, or round them to 32 bits
+        like = next(one for one in given if torch.is_tensor(one))
+        return function(*(one if torch.is_tensor(one) else new(like, one) for one in given))
+
+    def new(like: Any, number: float) -> Any:
+        return torch.full((), number, dtype=torch.float64, device=like.device)
 
     return of_tensors

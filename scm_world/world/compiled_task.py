@@ -366,8 +366,10 @@ class CompiledTask(Vectors):
     @property
     def constants(self) -> dict[int, float]:
         """The values of columns that have the same one in all worlds, by column."""
-        own = (zip(range(p.start, p.stop), np.ravel(v).tolist()) for p, v in self._written[1:])
-        return {at: value for values in own for at, value in values}
+        found: dict[int, float] = {}
+        for place, value in self._written[1:]:
+            found |= zip(range(place.start, place.stop), np.ravel(value).tolist(), strict=True)
+        return found
 
     def steps_of(self, name: str) -> list[Step]:
         """Return the steps that compute a variable from others, last what marks that it is done."""

@@ -34,9 +34,7 @@ class TensorRows:
         on_host: The variables that are computed on the host.
     """
 
-    def __init__(
-        self, rows: Rows, names: Iterable[str], device: str, copies: Counter[str]
-    ) -> None:
+    def __init__(self, rows: Rows, names: Iterable[str], device: str, copies: Counter[str]) -> None:
         torch = load("torch", "torch", "train")
         self._torch, self._rows, self._device = torch, rows, device
         self.table = torch.as_tensor(rows.numbers.T.copy(), device=device)
@@ -99,6 +97,10 @@ def _parts(compiled: CompiledTask, names: Iterable[str], torch: Any) -> tuple[li
     on_host: list[str] = []
     constants, static = compiled.constants, [compiled.where[n] for n in compiled.static_names]
     trace, now = Trace(), dict[int, Any](constants)
+
+    def written(values: dict[int, Any]) -> Expressions:
+        return Expressions(trace, {n: v for n, v in values.items() if n not in constants}, torch)
+
     for name in compiled.needed(names):
         steps, then = compiled.steps_of(name), dict(now)
         try:
@@ -106,12 +108,13 @@ def _parts(compiled: CompiledTask, names: Iterable[str], torch: Any) -> tuple[li
                 _trace(step, trace, now)
         except Untraceable:
             on_host.append(name)
-            parts.append(Expressions(trace, then, torch))
+            parts.append(written(then))
             trace, now = Trace(), dict(constants)
-            reads, writes = (np.concatenate(side) for side in zip(*map(_touched, steps)))
+            both = zip(*map(_touched, steps), strict=True)
+            reads, writes = (np.concatenate(side) for side in both)
             moving = np.setdiff1d(reads, [*constants, *places(static), *writes])
             parts.append((moving, program_of(steps), places([compiled.where[name]])))
-    parts.append(Expressions(trace, now, torch))
+    parts.append(written(now))
     return parts, on_host
 
 
