@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, final
 
@@ -13,7 +13,7 @@ from scm_world._arguments import typed, whole_number
 from scm_world._types import Floats
 from scm_world.fit.fitting import arguments_of, described
 from scm_world.fit.problem import STEP, FitProblem, Search
-from scm_world.fit.recordings import Noise, Recording
+from scm_world.fit.recordings import Begins, Noise, Recording
 from scm_world.fit.result import MISFIT, Fit
 from scm_world.fit.search import SAME, TRUST, Minima, Result, bounded, gauss_newton
 from scm_world.fit.shooting import Shooting
@@ -172,12 +172,14 @@ def explain(
     most: int = 1,
     noise: Noise = None,
     window: int | None = None,
+    begins: Begins = None,
+    setups: Sequence[Mapping[str, object]] | None = None,
     progress: Progress | None = None,
     search: Search = gauss_newton,
 ) -> Deviation:
     """Fit candidates to a recording, and compare them; see ``World.explain`` and ``Search``."""
     most, world = whole_number("most", most, least=1), world.for_fit(recording)
-    measured, targets = arguments_of(world, recording, candidates, window)
+    measured, targets = arguments_of(world, recording, candidates, window, begins, setups)
     given = measured.given(noise)
     with Shooting(world, measured, targets) as shooting:
         problem = FitProblem(shooting, measured, targets, given, window)
@@ -233,6 +235,9 @@ class _Comparison:
                 self._consider(best, self._slopes(best), fewer)
             if self._found().chosen == best:
                 self._search_thoroughly(best)
+        best = self._found().chosen
+        played = self._search.played(self._minima[best].at.scaled)
+        self._fits[best] = replace(self._fits[best], played=played)
         return self._found()
 
     def _found(self) -> Deviation:

@@ -332,7 +332,7 @@ class FitProblem:
                 column = np.nonzero(np.isfinite(self.measured.runs[run].values[first:last]))[1]
                 squares, each = by_column(column, one.residual**2, len(noise))
                 with np.errstate(invalid="ignore"):
-                    sizes.append(squares / each * size / free)
+                    sizes.append(np.where(self.known, 1.0, squares / each * size / free))
         if not sizes:
             return noise
         times = np.nan_to_num(np.sqrt(np.nanmedian(sizes, axis=0)), nan=1.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -26,13 +26,13 @@ from scm_world.errors import (
 from scm_world.geometry.rotations import aligned
 from scm_world.queries.episodes import Episode
 from scm_world.runs.files import located, read_arrays, read_bytes
-from scm_world.variables import Box, Rotations
+from scm_world.variables import Box, Rotations, Variable
 from scm_world.world import Simulation
 
 if TYPE_CHECKING:
     import pandas as pd
 
-TIME, EPISODE = "time", "episode"
+TIME, EPISODE, SETUP, DO = "time", "episode", "do", "do."
 JITTER = 0.25  # of a control step: largest error of a time
 DRIFT = 0.002  # largest relative error of a clock
 GAP = 1.5  # of the usual distance of rows: a longer one ends a run
@@ -40,6 +40,7 @@ LONG = 500  # control steps from row to row, of which one of another unit of tim
 FEW = 5  # measurements of which noise can be estimated
 FLOOR = 1e-6  # least noise, relative to the spread of a column
 LEAST = 1e-9  # least noise
+REST = 1e-3  # standard deviation of a velocity or an activation at rest
 SHOWN = 20  # names that a message lists
 ROUNDING = 1e-3  # of a range, by which commands of a file may exceed it
 UNIT = 10.0  # of a range, which is soft: states that exceed it by more are in another unit
@@ -62,6 +63,9 @@ Recording: TypeAlias = object
 
 Noise: TypeAlias = float | Mapping[str, float | None] | None
 """Standard deviation of the noise: of all columns, by patterns of columns, or None: estimated."""
+
+Begins: TypeAlias = str | Mapping[str, tuple[float, float]] | None
+"""How runs begin: "rest", or values with standard deviations by patterns of states, or unknown."""
 
 Limits: TypeAlias = Mapping[str, tuple[float, float]]
 """Ranges by names or patterns of columns."""
@@ -94,12 +98,16 @@ class RecordedRun:
             from 0, shape (rows,).
         values: Measurements, shape (rows, columns); NaN where nothing was measured.
         begin: Time of its first row [s].
+        whole: Whether it begins with the recording, and not after a gap.
+        do: Its set-up: values of parameters that were set for it, by columns.
     """
 
     commands: Floats
     instants: Integers
     values: Floats
     begin: float = 0.0
+    whole: bool = True
+    do: Mapping[str, float] = field(default_factory=dict)
 
     @cached_property
     def filled(self) -> Floats:
@@ -111,6 +119,14 @@ class RecordedRun:
                 column[:] = np.interp(self.instants, self.instants[seen], column[seen])
         return found
 
+    def part(self, first: int, last: int, control_dt: float) -> RecordedRun:
+        """Return the run from a row to that before another one, with the length of a step [s]."""
+        since, instants = int(self.instants[first]), self.instants[first:last]
+        sent = self.commands[since : int(instants[-1])]
+        begin, whole = self.begin + control_dt * since, self.whole and not first
+        rest = self.values[first:last], begin, whole, self.do
+        return RecordedRun(sent, instants - since, *rest)
+
 
 @final
 @dataclass(frozen=True, eq=False)
@@ -121,11 +137,18 @@ class Measurements:
         runs: The runs.
         columns: Their measured columns.
         control_dt: Length of a control step [s].
+        begins: Standard deviations of the last columns, which are known where a run begins.
     """
 
     runs: tuple[RecordedRun, ...]
     columns: tuple[MeasuredNumber, ...]
     control_dt: float
+    begins: tuple[float, ...] = ()
+
+    @property
+    def recorded(self) -> tuple[MeasuredNumber, ...]:
+        """The columns that were recorded."""
+        return self.columns[: len(self.columns) - len(self.begins)]
 
     @cached_property
     def values(self) -> Floats:
@@ -164,24 +187,24 @@ class Measurements:
                 to estimate it.
             UnknownVariable: A pattern fits no column.
         """
-        found = np.full(len(self.columns), np.nan)
-        places = {column.name: i for i, column in enumerate(self.columns)}
+        found = np.full(len(self.recorded), np.nan)
+        places = {column.name: i for i, column in enumerate(self.recorded)}
         for pattern, value in (noise if isinstance(noise, Mapping) else {"*": noise}).items():
             if value is None and pattern == "*":
                 continue
             deviation = real_number("noise", value)
             if deviation <= 0.0:
                 raise UnknownOption("noise", value, ("a standard deviation above zero",))
-            whole = [c.name for c in self.columns if fits(c.variable, (pattern,))]
+            whole = [c.name for c in self.recorded if fits(c.variable, (pattern,))]
             for name in whole or fitting(pattern, places):
                 found[places[name]] = deviation
         counts = np.isfinite(self.values).sum(axis=0)
-        for column, given, n in zip(self.columns, found, counts, strict=True):
+        for column, given, n in zip(self.recorded, found, counts, strict=False):
             if n < (FEW if np.isnan(given) else 1):
                 about = f"noise of {column.name}", f"not given: {n} measurements"
                 allowed = f"estimated from at least {FEW} measurements; give noise="
                 raise UnknownOption(*about, (f"{allowed}, or leave it out",))
-        return found
+        return np.append(found, self.begins)
 
 
 def labels(name: str, shape: tuple[int, ...]) -> list[str]:
@@ -194,7 +217,40 @@ def labels(name: str, shape: tuple[int, ...]) -> list[str]:
     return [name] if shape == () else [f"{name}[{i}]" for i in range(int(np.prod(shape)))]
 
 
-def read_recording(world: Simulation, recording: Recording) -> Measurements:
+def setup_of(world: Simulation, do: Any) -> dict[str, float]:
+    """Return the set-up of a run, values of parameters by name, by its columns.
+
+    Raises:
+        UnknownOption: It is no dictionary, or a value has another shape.
+        UnknownVariable: A name is not that of a parameter that can be set.
+    """
+    if not isinstance(do, Mapping):
+        raise UnknownOption("set-up", do, ("a dictionary of values of parameters by name",))
+    known, found = settable_of(world), dict[str, float]()
+    parts = {label: name for name in known for label in labels(name, known[name].shape)}
+    for name, value in do.items():
+        if name not in known and name not in parts:
+            raise UnknownVariable(str(name), [*known, *parts])
+        own = labels(name, known[name].shape) if name in known else [name]
+        try:
+            numbers = np.asarray(value, float).ravel()
+        except (TypeError, ValueError):
+            numbers = np.array([np.nan])
+        if len(numbers) != len(own) or not np.isfinite(numbers).all():
+            raise UnknownOption(f"set-up of {name!r}", value, (f"{len(own)} finite numbers",))
+        found |= dict(zip(own, numbers.tolist(), strict=True))
+    return found
+
+
+def settable_of(world: Simulation) -> dict[str, Variable]:
+    """Return the parameters of real numbers that can be set, by name."""
+    variables = {name: world.model.declared(name) for name in world.compiled.static_names}
+    return {n: v for n, v in variables.items() if v.is_root and v.settable and v.dtype == "real"}
+
+
+def read_recording(
+    world: Simulation, recording: Recording, setups: Sequence[Mapping[str, object]] | None = None
+) -> Measurements:
     """Read a recording.
 
     A run ends where a command is not known: at a gap, which is longer than the usual (median)
@@ -204,13 +260,21 @@ def read_recording(world: Simulation, recording: Recording) -> Measurements:
         world: The model of the recorded system, which defines the control step and the meaning of
             the columns.
         recording: See ``World.fit``.
+        setups: The set-up of each of several recordings, if they do not have it.
 
     Raises:
-        UnknownOption: The recording is of another kind.
+        UnknownOption: The recording is of another kind, or has another number of set-ups.
         ModelError: The tables have faults; see ``World.fit``.
         UnreadableFile: A file cannot be read.
     """
-    frames, known = [*_frames(world, recording)], columns_of(world)
+    known = columns_of(world)
+    frames: list[tuple[str, pd.DataFrame, bool]] = []
+    every = [*recording] if isinstance(recording, list | tuple) else [recording]
+    if setups is not None and len(setups) != len(every):
+        raise UnknownOption("setups", f"{len(setups)} set-ups", (f"{len(every)}, one of each",))
+    for number, one in enumerate(every, 1):
+        label = f"run {number}" if one is not recording else ""
+        frames += _frames(world, one, label, {} if setups is None else setups[number - 1])
     if not frames:
         raise UnknownOption("recording", recording, ("one or more runs",))
     for label, frame, _ in frames:
@@ -226,6 +290,69 @@ def read_recording(world: Simulation, recording: Recording) -> Measurements:
     return Measurements(tuple(runs), columns, world.options.control_period)
 
 
+def at_rest(world: Simulation, run: RecordedRun) -> dict[str, float]:
+    """Return velocities and activations at rest: 0, or the first command that these follow."""
+    commands, found = commands_of(world, bundles=True), dict[str, float]()
+    for name in _states(world):
+        stem, _, kind = name.rpartition(".")
+        if kind == "activation" or kind.endswith(("velocity", "velocities")):
+            followed = f"{stem}.timeconst" in world.compiled.parameter_keys
+            command = commands.get(f"{stem}.control" if followed and kind == "activation" else "")
+            value = 0.0 if command is None else float(run.commands[0, command.component])
+            found |= dict.fromkeys(labels(name, world.model.declared(name).shape), value)
+    return found
+
+
+def begun(world: Simulation, measured: Measurements, begins: Begins) -> Measurements:
+    """Return a recording that begins as is known, which is a further measurement of its first row.
+
+    Args:
+        world: A twin of the world.
+        measured: The recording.
+        begins: "rest": velocities and activations as ``at_rest``, with a standard deviation of
+            0.001; or values and standard deviations by patterns of states.
+
+    Raises:
+        UnknownOption: It is something else, or a standard deviation is not positive.
+        UnknownVariable: A pattern fits no state.
+    """
+    if begins is None:
+        return measured
+    states = {label for n in _states(world) for label in labels(n, world.model.declared(n).shape)}
+    known, every = columns_of(world), list[dict[str, tuple[float, float]]]()
+    for run in measured.runs:
+        if begins == "rest":
+            rest = at_rest(world, run).items()
+            every.append({name: (value, REST) for name, value in rest})
+        elif isinstance(begins, Mapping):
+            every.append({})
+            for pattern, given in begins.items():
+                pair = np.asarray(given, float)
+                if pair.shape != (2,) or not np.isfinite(pair).all() or pair[1] <= 0.0:
+                    allowed = ("a value and a standard deviation above zero",)
+                    raise UnknownOption(f"begins[{pattern!r}]", given, allowed)
+                value, deviation = map(float, pair)
+                whole = [n for n in known if n in states and fits(known[n].variable, (pattern,))]
+                names = whole or fitting(pattern, states)
+                every[-1] |= dict.fromkeys(names, (value, deviation))
+        else:
+            raise UnknownOption("begins", begins, ("rest", "values and deviations by states"))
+    names = [*every[0]]
+    if not names:
+        raise UnknownOption("begins", begins, ("that of a world with velocities or activations",))
+    runs = list[RecordedRun]()
+    for run, one in zip(measured.runs, every, strict=True):
+        first = np.full((len(run.values), len(names)), np.nan)
+        if run.whole:
+            first[0] = [one[name][0] for name in names]
+        runs.append(replace(run, values=np.hstack([run.values, first])))
+    columns = [known[name]._replace(name=f"{name} at the start") for name in names]
+    deviations = tuple(every[0][name][1] for name in names)
+    return replace(
+        measured, runs=tuple(runs), columns=(*measured.columns, *columns), begins=deviations
+    )
+
+
 def _refuse(problems: Iterable[str], label: str = "") -> None:
     """Raise the faults of a table, if there are any."""
     if found := [f"{label}: {problem}" if label else problem for problem in problems]:
@@ -236,10 +363,18 @@ def _refuse(problems: Iterable[str], label: str = "") -> None:
 
 
 def _frames(
-    world: Simulation, given: Any, label: str = ""
+    world: Simulation, given: Any, label: str = "", do: object = None
 ) -> Iterator[tuple[str, pd.DataFrame, bool]]:
-    """Yield each table or episode: a name, a frame with the time [s], and if we recorded it."""
+    """Yield each table or episode: a name, a frame with the time [s], and if we recorded it.
+
+    Its set-up becomes columns.
+    """
     import pandas as pd
+
+    if do:
+        setup = {f"{DO}{name}": value for name, value in setup_of(world, do).items()}
+        yield from ((n, frame.assign(**setup), by) for n, frame, by in _frames(world, given, label))
+        return
 
     dt = world.options.control_period
     if isinstance(given, list | tuple):
@@ -259,7 +394,8 @@ def _frames(
         else:
             yield label, frame, False
     elif isinstance(given, Mapping):
-        yield from _frames(world, _framed(given), label)
+        arrays = {name: given[name] for name in given if name != SETUP}
+        yield from _frames(world, _framed(arrays), label, given.get(SETUP))
     elif hasattr(given, "iterate_episodes"):  # a dataset of Minari
         _refuse_scaled(given)
         for one in given.iterate_episodes():
@@ -393,11 +529,20 @@ def _faults(world: Simulation, frame: pd.DataFrame) -> Iterator[str]:
         return
     if len(frame) < 2:
         yield f"a run has two rows or more, got {len(frame)}"
+    setup = [name for name in names if name.startswith(DO)]
     parameters = [name for name in names if name.partition("[")[0] in world.compiled.static]
     if parameters:
         said = f"the columns {', '.join(parameters)} are parameters, which are not measured"
-        yield f"{said}: leave them out, or fix them with world.given({{…}})"
-    there = {TIME, *commands, *known}
+        said += f": name them {', '.join(f'{DO}{name}' for name in parameters)}, if they were set"
+        yield f"{said} for this run, leave them out, or fix them with world.given({{…}})"
+    if setup:
+        settable = settable_of(world)
+        parts = [f"{DO}{label}" for n, v in settable.items() for label in labels(n, v.shape)]
+        yield from (f"{UnknownVariable(n, parts)}" for n in setup if n not in parts)
+        several = (name for name in setup if frame[name].nunique() > 1)
+        advice = "one run has one set-up: tell runs apart by a column 'episode'"
+        yield from (f"the column {name!r} has several values: {advice}" for name in several)
+    there = {TIME, *commands, *known, *setup}
     unknown = [name.partition("[")[0] for name in names if name not in {*parameters, *there}]
     for name in dict.fromkeys(unknown):
         yield f"rename a column, or leave it out: {UnknownVariable(name, sorted(there))}"
@@ -469,7 +614,10 @@ def _runs(
             _refuse([f"{said}, or resample the recording"], label)
         if np.isfinite(values[rows]).any():
             commands = np.repeat(np.clip(sent[rows[:-1]], low, high), repeats, axis=0)
-            yield RecordedRun(commands, instants, values[rows], float(time[rows[0]]))
+            begin, whole = float(time[rows[0]]), not rows[0]
+            setup = [str(n) for n in numbers if str(n).startswith(DO) and numbers[n].notna().any()]
+            do = {name.removeprefix(DO): float(numbers[name].max()) for name in setup}
+            yield RecordedRun(commands, instants, values[rows], begin, whole, do)
 
 
 def _not_rising(time: Floats, dt: float) -> Iterator[str]:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, final
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from scm_world._arguments import typed, whole_number
 from scm_world._types import Floats, Integers
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.fit.design import PROBES, Experiment, suggested, unseen
+from scm_world.fit.prediction import Prediction, predicted
 from scm_world.fit.problem import (
     SHORT,
     WINDOW,
@@ -25,9 +26,25 @@ from scm_world.fit.problem import (
     spread_of,
     windows_of,
 )
-from scm_world.fit.recordings import Limits, MeasuredNumber, Measurements, RecordedRun
+from scm_world.fit.recordings import (
+    Limits,
+    MeasuredNumber,
+    Measurements,
+    RecordedRun,
+    at_rest,
+    columns_of,
+    read_recording,
+)
 from scm_world.fit.shooting import Shooting
-from scm_world.fit.targets import FAR, Target, delay_of, ranges_of, values_of
+from scm_world.fit.targets import (
+    FAR,
+    Target,
+    delays_of,
+    free_states,
+    ranges_of,
+    twin_of,
+    values_of,
+)
 from scm_world.geometry.rotations import aligned
 from scm_world.queries.world import World
 from scm_world.runs.canvas import PALETTE, blank, styled
@@ -42,6 +59,8 @@ CONFIDENCE = 0.95
 
 DETERMINED = 0.25  # largest standard error of a determined combination: a share of the value
 MISFIT = 1.5  # least residual that the noise does not explain, in standard deviations of it
+AWAY = 0.5  # of the spread of a state in the recording, at which it is far from rest
+WORSE = 1.1  # times the error of the unfitted world, with which a fit replays worse than it
 MAIN = 0.3  # least share of a parameter in a combination that is named
 DRAWN = 8  # columns of a picture
 
@@ -65,6 +84,8 @@ class Fit:
         reach: How far the intervals reach down and up, scaled, shape (p, 2); None if linearised.
         shortened: Whether the windows are shorter than usual because segments did not join.
         ended: Whether the search took all its steps before it found a minimum.
+        played: See ``replay``, of the fit and the unfitted world, (2, columns).
+        later: The rows that were held out.
 
     Example:
         >>> from scm_world.queries import World
@@ -92,6 +113,8 @@ class Fit:
     reach: Floats | None = None
     shortened: bool = False
     ended: bool = False
+    played: Floats | None = None
+    later: Measurements | None = None
 
     @property
     def runs(self) -> tuple[RecordedRun, ...]:
@@ -117,16 +140,16 @@ class Fit:
         (``motor.control_delay``), so that the world replays the recording.
 
         Raises:
-            UnknownOption: A delay was fitted beside commands that have one already.
             ModelError: A delay was fitted to a step function.
         """
-        world, late = self.asked, delay_of(self.targets, self.scaled)
-        if late:
+        world, late = self.asked, delays_of(self.asked, self.targets, self.scaled)
+        if late.any():
             build, (kind, task, options, _), *_ = world.__reduce__()
             if not isinstance(task, ModelTask):
-                problem = f"its commands cannot be delayed by {late:.3g} control steps"
+                problem = f"its commands cannot be delayed by {late.max():.3g} control steps"
                 raise ModelError([f"{problem}: delay them in the step function, or before it"])
-            world = build(kind, task.delayed(late), options, None)
+            each = {n: late[at].max() for n, at in world.compiled.actions.items()}
+            world = build(kind, task.delayed(each), options, None)
             world._given = self.asked._given
         return world.given(values_of(self.targets, self.scaled))
 
@@ -269,7 +292,7 @@ class Fit:
                 low, high = sorted((float(low), float(high)))
                 width, most = (high - low) / target.scale, max(abs(value) / target.scale, 1.0)
             at_most = open_ends[0][0] and high <= target.default
-            determined = bool((width <= most or at_most) and not self.ended)
+            determined = bool((width <= most or at_most) and not (self.ended or self.worse))
             if open_ends[0][0] and open_ends[1][1]:
                 low, high, determined = np.nan, np.nan, False
             deviation = value / target.default - 1.0 if target.default else np.nan
@@ -362,9 +385,68 @@ class Fit:
         ratio = float(moved @ moved) / self.discount / rank
         return ratio > float(fdtri(rank, self.degrees, CONFIDENCE))
 
+    @cached_property
+    def replay(self) -> pd.DataFrame:
+        """Runs that are played from their first row, without measurements on the way.
+
+        A row for each measured column, with its ``unit`` and the root mean square of measured
+        minus played, by the ``fit``, by the ``unfitted`` world from the same start, and by a
+        ``constant``, the mean of the column.
+        """
+        import pandas as pd
+
+        columns = self.measured.recorded
+        n = len(columns)
+        mean = np.nanstd(self.measured.values, axis=0)[:n]
+        fit, unfitted = np.full((2, n), np.nan) if self.played is None else self.played[:, :n]
+        about = {"column": [c.name for c in columns], "unit": [c.unit for c in columns]}
+        return pd.DataFrame({**about, "fit": fit, "unfitted": unfitted, "constant": mean})
+
+    @property
+    def _replayed(self) -> tuple[float, float]:
+        """The errors of the replay of the fit and the unfitted world, in those of a constant."""
+        size = np.maximum(self.replay.constant, self.measured.least[: len(self.replay)])
+        one, other = (((self.replay[kind] / size) ** 2).mean() for kind in ("fit", "unfitted"))
+        return float(one) ** 0.5, float(other) ** 0.5
+
+    @property
+    def worse(self) -> bool:
+        """Whether the unfitted world replays the recording better than the fit and a constant."""
+        fit, unfitted = self._replayed
+        return unfitted < min(1.0, fit / WORSE)
+
+    @typed
+    def predict(self, recording: object, *, ahead: float | None = None) -> Prediction:
+        """Predict another recording, beside the world that was asked and a constant.
+
+        It is cut into windows that do not overlap. The fitted and the unfitted world each begin
+        where the first ten rows of a window show, and predict the others.
+
+        Args:
+            recording: The recording, of the kinds of ``World.fit``.
+            ahead: How far to predict [s]; 40 rows if None, or as a window of the fit.
+
+        Raises:
+            UnknownOption: No window has a row to predict.
+            ModelError: The recording has faults.
+        """
+        with twin_of(self.asked) as twin:
+            return predicted(self, read_recording(twin, recording), ahead)
+
+    @cached_property
+    def held_out(self) -> Prediction | None:
+        """The prediction of the rows that were held out, if there are such rows."""
+        return None if self.later is None else predicted(self, self.later, None)
+
     def __str__(self) -> str:
         table = self.table.to_string(index=False, float_format="{:.4g}".format, na_rep="none")
-        return "\n".join([table, *self.remarks])
+        parts = [table, *self.remarks]
+        if self.played is not None:
+            replay = self.replay.to_string(index=False, float_format="{:.4g}".format)
+            parts.append(f"played from the first row, root mean square of the error:\n{replay}")
+        if self.held_out is not None:
+            parts.append(f"held out: {self.held_out}")
+        return "\n".join(parts)
 
     __repr__ = __str__
 
@@ -374,9 +456,11 @@ class Fit:
         rows = sum(len(run.instants) for run in self.runs)
         time = sum(int(run.instants[-1]) for run in self.runs) * self.measured.control_dt
         runs = "a run" if len(self.runs) == 1 else f"{len(self.runs)} runs"
-        lost = 1.0 - len(self.residual) / (rows * len(self.columns))
+        recorded = self.measured.recorded
+        seen = np.isfinite(self.measured.values[:, : len(recorded)])
+        lost = 1.0 - float(seen.mean())
         rest = f", {100.0 * lost:.2g} % not measured" * (lost > 0.0)
-        columns = f"{len(self.columns)} measured column" + "s" * (len(self.columns) > 1)
+        columns = f"{len(recorded)} measured column" + "s" * (len(recorded) > 1)
         return f"{runs} of {rows} rows, {time:.4g} s, {columns}{rest}"
 
     @property
@@ -390,7 +474,18 @@ class Fit:
             f"no experiment of this model seems to determine {name}: it changes {tried}"
             for name in self.unseen
         ]
-        groups = (tuple(n for n in names if n not in self.unseen) for names in self.confounded)
+        groups = [tuple(n for n in names if n not in self.unseen) for names in self.confounded]
+        if self.worse:
+            found.append(
+                "played from the first row, the unfitted world is nearer to the recording than the "
+                "fit: none of these values is determined"
+            )
+            groups = []
+        elif self._replayed[0] > WORSE:
+            found.append(
+                "played from the first row, a constant is nearer to the recording than the fit, "
+                "which does not predict that far ahead"
+            )
         for names in filter(None, groups):
             alone = len(names) == 1
             said = "is not determined" if alone else "cannot be told apart"
@@ -398,6 +493,13 @@ class Fit:
                 f"{', '.join(names)} {said} by this recording; suggest(1), or --suggest 1 of the "
                 f"command, has an experiment that does it"
             )
+        if self.asked is not None and self.asked.substeps == 1:
+            found += [
+                f"{target.name}: a control step has one physics step, in which a delay that ends "
+                "there is the mean of two commands"
+                for target in self.targets
+                if target.values is None
+            ]
         if self.shortened:
             found.append(
                 f"windows of {WINDOW} rows do not explain the recording, those of {self.window} "
@@ -407,10 +509,12 @@ class Fit:
             if size >= MISFIT:
                 said = f"the residuals of {name} are {size:.3g} times as large as its noise"
                 shorter = f"; where bodies bump, window={SHORT} may" * (self.window != SHORT)
-                found.append(f"{said}: no values that were found explain them{shorter}")
+                began = "; or it did not begin as begins= says" * bool(self.measured.begins)
+                found.append(f"{said}: no values that were found explain them{shorter}{began}")
         ends = self.table[["low", "high"]].to_numpy(float)
         sure = self.table.determined.to_numpy(bool)
         about = zip(self.targets, self.scaled, ends, sure, strict=True)
+        found += self._far_starts
         for target, number, (low, high), determined in about:
             if determined and low <= target.value(target.low) < target.value(number):
                 unit = f" {target.unit}" * (target.unit not in ("", "1"))
@@ -420,6 +524,30 @@ class Fit:
                 found.append(f"{target.name} is at the end of its range")
         return tuple(found)
 
+    @property
+    def _far_starts(self) -> list[str]:
+        """Sentences on runs that begin far from rest in what was not measured."""
+        if self.asked is None:
+            return []
+        known, places = {c.variable for c in self.columns}, columns_of(self.asked)
+        spans, found = np.full(self.starts.shape[1], np.inf), list[str]()
+        spans[free_states(self.asked)] = self.spans
+        for start, window in zip(self.starts, windows_of(self.runs, self.window), strict=True):
+            run = self.runs[window.run]
+            for name, rest in at_rest(self.asked, run).items() if not window.first else ():
+                _, variable, component, unit = places[name]
+                place = self.asked.compiled.where[variable].start + component
+                if (
+                    run.whole
+                    and variable not in known
+                    and abs(start[place] - rest) > AWAY * spans[place]
+                ):
+                    found.append(
+                        f"run {window.run} begins at {name} = {start[place]:.3g} {unit}, which was "
+                        f"not measured: if it was at rest, say so, begins='rest'"
+                    )
+        return found
+
     def suggest(
         self,
         n: int = 1,
@@ -427,6 +555,7 @@ class Fit:
         steps: int | None = None,
         limits: Limits | None = None,
         seed: int = 0,
+        setups: Sequence[Mapping[str, object]] = (),
     ) -> tuple[Experiment, ...]:
         """Suggest experiments that determine the least determined parameters.
 
@@ -440,15 +569,19 @@ class Fit:
             limits: Ranges of commands, states or readouts by patterns of columns, such as
                 ``{"elbow.velocity": (-2, 2)}``. The ranges of commands and joints always hold.
             seed: Seed of the sequences.
+            setups: Set-ups that the machine may have, besides its own: values of parameters,
+                ``[{"weight.mass": 1.0}]``. An experiment in one of them says so (``do``).
 
         Raises:
             UnknownOption: Limits exceed the range of a command, or every sequence leaves them.
+            InterventionError: A set-up is refused.
             UnknownVariable: A pattern of limits fits no column.
         """
         longest = max(len(run.commands) for run in self.runs)
         count = longest if steps is None else steps
         known = self.sensitivities / np.sqrt(self.discount)
-        return suggested(self, known, n, steps=count, limits=limits, seed=seed)
+        how: Any = {"steps": count, "limits": limits, "seed": seed, "setups": setups}
+        return suggested(self, known, n, **how)
 
     def counterfactual(
         self, do: Mapping[str, object], *, at: int = 0, run: int = 0, draws: int = 32, seed: int = 0
@@ -507,11 +640,12 @@ class Fit:
         tails = 0.5 * (1.0 - CONFIDENCE)
         ends = np.quantile(found[1:], (tails, 1.0 - tails), axis=0)
         time = recorded.begin + self.measured.control_dt * recorded.instants
-        names = [column.name for column in self.columns]
+        names = [column.name for column in self.measured.recorded]
         about = {"time": np.tile(time, len(names)), "column": np.repeat(names, len(time))}
         kinds = {"measured": recorded.values, "counterfactual": found[0]}
         kinds |= {"low": ends[0], "high": ends[1]}
-        return pd.DataFrame({**about, **{kind: kinds[kind].T.ravel() for kind in kinds}})
+        values = {kind: kinds[kind][:, : len(names)].T.ravel() for kind in kinds}
+        return pd.DataFrame({**about, **values})
 
     @cached_property
     def residuals(self) -> pd.DataFrame:
@@ -550,7 +684,7 @@ class Fit:
             rows.loc[part.index, "time"] += shift
             end = part.time.max() + shift
         worst = sorted(self.misfit, key=self.misfit.__getitem__)[-DRAWN:]
-        names = [column.name for column in self.columns if column.name in worst]
+        names = [c.name for c in self.measured.recorded if c.name in worst]
         figure = blank(9.0, 0.6 + 2.2 * len(names))
         figure.set_layout_engine("constrained")
         axes = figure.subplots(len(names), 2, squeeze=False, sharex=True)

@@ -13,14 +13,30 @@ from numpy.typing import NDArray
 from scm_world._types import Floats, Integers
 from scm_world.errors import EngineFailure
 from scm_world.fit.problem import SHORT, STEP, Simulated, Simulator, Window
-from scm_world.fit.recordings import LEAST, Measurements, RecordedRun, rotations_of
-from scm_world.fit.targets import Target, begin, delay_of, values_of
+from scm_world.fit.recordings import (
+    LEAST,
+    Measurements,
+    RecordedRun,
+    labels,
+    rotations_of,
+    settable_of,
+)
+from scm_world.fit.targets import (
+    Target,
+    begin,
+    delays_of,
+    free_states,
+    remembered,
+    values_of,
+)
 from scm_world.geometry.rotations import aligned
 from scm_world.models import Difference
+from scm_world.models.model import HELD
 from scm_world.models.scene import SURFACES
 from scm_world.queries.twins import twins_of
 from scm_world.queries.world import World
 from scm_world.runs.processes import cores
+from scm_world.tasks.channels import switched
 from scm_world.variables import Rotations
 from scm_world.world import Simulation
 
@@ -48,14 +64,19 @@ class Shooting(Simulator):
         world.require_exact("a fit, whose sensitivities are differences of paired runs,")
         self.world, self.runs, self.columns = world, measured.runs, measured.columns
         self.targets, self._open = tuple(targets), ExitStack()
-        self._names = tuple(dict.fromkeys(c.variable for c in self.columns))
+        self._names = tuple(dict.fromkeys(c.variable for c in measured.recorded))
         segments = sum(-(-len(run.instants) // SHORT) for run in self.runs)
         n = min(ROWS, 2 * segments * (2 + len(targets)))
         together = twins_of(world).together(n, self._names, cores())
         self._batch = self._open.enter_context(together)
         self._reset()
         first = self._batch.world(0)
-        self.free = np.flatnonzero(first.structure.layout.can_be_set)
+        self.free = free_states(first)
+        held = (row for row in first.composition.system.states if getattr(row, "array", "") == HELD)
+        layout = first.structure.layout.slices  # of what the world keeps by itself
+        self._held = [
+            i for row in held for i in range(layout[row.name].start, layout[row.name].stop)
+        ]
         self.turned = [
             where
             for name, where in first.compiled.slices.items()
@@ -63,8 +84,18 @@ class Shooting(Simulator):
         ]
         places = first.compiled.where
         self._places = np.array([places[c.variable].start + c.component for c in self.columns])
-        self.rotations = rotations_of(first, self.columns)
-        written = {target.variable for target in targets if target.values is not None}
+        self._begins = range(len(measured.recorded), len(self.columns))
+        self.rotations = rotations_of(first, measured.recorded)
+        begin(first, world)
+        self._places_of = {
+            label: (name, i)
+            for name, variable in settable_of(first).items()
+            for i, label in enumerate(labels(name, variable.shape))
+        }
+        self._setups = [*dict.fromkeys(tuple(run.do.items()) for run in self.runs)]
+        names = {self._places_of[label][0] for setup in self._setups for label, _ in setup}
+        self._usual = {name: np.array(first[name], float) for name in names}
+        written = names.union(t.variable for t in targets if t.values is not None)
         acting = written.union(*map(first.model.descendants, written))
         follow = [name for name in first.compiled.static_names if name in acting]
         keys = first.compiled.parameter_keys
@@ -82,14 +113,15 @@ class Shooting(Simulator):
     def guess(self, windows: Sequence[Window]) -> Floats:
         """Guess start states from the measurements, and their spans; see ``Simulator``.
 
-        These are measured numbers and slopes of measured positions; the rest is simulated from the
-        window before, or the default.
+        These are measured numbers and slopes of measured positions, and how a run is known to
+        begin; the rest is simulated from the window before, or the default.
         """
         world = self._batch.world(0)
         begin(world, self.world)
         where, default = world.compiled.slices, world.vector.copy()
         known, moving = [], []  # measured numbers, and velocities of measured positions
-        for i, (_, name, component, _) in enumerate(self.columns):
+        begun = [(self._places[i], i) for i in self._begins]
+        for i, (_, name, component, _) in enumerate(self.columns[: self._begins.start]):
             if name in where:
                 known.append((where[name].start + component, i))
                 stem, _, quantity = name.rpartition(".")
@@ -127,6 +159,11 @@ class Shooting(Simulator):
                     turns = back * turned if frame == "body" else turned * back
                     vector[speed] = np.polyfit(time - time[0], turns.as_rotvec(), 1)[0]
                     mine[speed] = True
+            for i, past in remembered(world).items() if len(run.commands) else ():
+                sent = run.instants[first] - 1 - np.arange(past.stop - past.start)
+                vector[past], mine[past] = run.commands[np.maximum(sent, 0), i], True
+            for place, i in begun if not first and run.whole else ():
+                vector[place], mine[place] = run.values[0, i], True
             for turned_places in self.turned:
                 norm = float(np.linalg.norm(vector[turned_places]))
                 vector[turned_places] /= max(norm, 1e-9)
@@ -196,11 +233,21 @@ class Shooting(Simulator):
             vector[world.compiled.slices[name].start + 2] += LIFT * (1 + i)
         return vector
 
-    def _write(self, world: Simulation, scaled: Floats) -> None:
-        """Set the parameters of a twin, which is in any state afterwards."""
+    def _write(self, world: Simulation, scaled: Floats, setup: Iterable[tuple[str, float]]) -> None:
+        """Set the parameters of a twin for a set-up; it is in any state afterwards."""
         if self._apart is not None:
             self._place(world, self._apart)
-        world.do(values_of(self.targets, scaled))
+        usual = {name: values.copy() for name, values in self._usual.items()}
+        values = usual | values_of(self.targets, scaled)
+        for label, value in setup:
+            name, place = self._places_of[label]
+            values[name].reshape(-1)[place] = value
+        world.do(values)
+
+    def _key(self, run: int, scaled: Floats) -> bytes:
+        """Return what tells the parameters of a run from others."""
+        setup = tuple(self.runs[run].do.items())
+        return scaled.tobytes() + (b"%d" % self._setups.index(setup)) * bool(self._usual)
 
     def _copy(self, world: Simulation, other: Simulation) -> None:
         """Set the parameters of a twin to those of another one."""
@@ -211,6 +258,7 @@ class Shooting(Simulator):
         """Put a twin into a state, which measurements with noise may put out of its bounds."""
         world.backend.apply(Difference(state=world.compiled.empty_state(vector.copy())))
         world.backend.read(world.state)
+        world.state.vector[self._held] = vector[self._held]
         world.version += 1
 
     def _reset(self) -> None:
@@ -219,22 +267,26 @@ class Shooting(Simulator):
         self._set = [b""] * len(self._batch)  # the parameters of each row
 
     def _commands(self, run: RecordedRun, scaled: Floats, steps: Integers) -> Floats:
-        """Return the commands of some control steps, after their delay.
+        """Return what acts in each physics step of some control steps; see ``switched``.
 
-        A command that comes within a control step acts in proportion to its share of the step.
+        Shape (n, substeps, n_actions), or (n, n_actions) without delays, or with one physics step.
         """
-        late = delay_of(self.targets, scaled)
-        if not late or not len(run.commands):
-            return run.commands[steps]
-        before = np.floor(steps - late).astype(int)
-        share = ((steps - late) - before)[:, None]
-        last = len(run.commands) - 1
-        one, other = (run.commands[np.clip(before + i, 0, last)] for i in (0, 1))
-        return np.asarray((1.0 - share) * one + share * other)
+        world, sent = self._batch.world(0), run.commands
+        delays, last = delays_of(world, self.targets, scaled), len(sent) - 1
+        if not delays.any() or not len(sent):
+            return sent[steps]
+        acting = np.empty((len(steps), world.substeps, len(delays)))
+        for i, delay in enumerate(delays.tolist()):
+            whole, shares = switched(delay, world.substeps)
+            new, old = (sent[np.clip(steps - whole - late, 0, last), i, None] for late in (0, 1))
+            acting[..., i] = new + np.array(shares or (0.0,)) * (old - new)
+        return acting if world.substeps > 1 else acting[:, 0]
 
     def simulate(self, tasks: Sequence[tuple[Window, Floats, Floats]]) -> list[Simulated]:
         """Simulate windows; see ``Simulator``."""
-        order = sorted(range(len(tasks)), key=lambda i: (tasks[i][1].tobytes(), i))
+        order = sorted(
+            range(len(tasks)), key=lambda i: (self._key(tasks[i][0].run, tasks[i][1]), i)
+        )
         turns = -(-len(tasks) // len(self._batch))
         n = -(-len(tasks) // turns)  # parameters are written to no more twins than needed
         shares = [part.tolist() for part in np.array_split(np.array(order, int), n)]
@@ -276,16 +328,16 @@ class Shooting(Simulator):
             world = self._batch.world(row)
             if self._set[row] == LOST:
                 begin(world, self.world)
-            if self._set[row] != scaled.tobytes():
-                alike = self._set.index(scaled.tobytes()) if scaled.tobytes() in self._set else None
+            run, key = self.runs[window.run], self._key(window.run, scaled)
+            if self._set[row] != key:
+                alike = self._set.index(key) if key in self._set else None
                 self._set[row] = b"?"
                 if alike is None:
-                    self._write(world, scaled)
+                    self._write(world, scaled, run.do.items())
                 else:
                     self._copy(world, self._batch.world(alike))
-                self._set[row] = scaled.tobytes()
+                self._set[row] = key
             self._place(world, vector)
-            run = self.runs[window.run]
             since = run.instants[window.first]
             end = run.instants[min(window.last, len(run.instants) - 1)]  # where the next one begins
             commands[row] = self._commands(run, scaled, np.arange(since, end))
@@ -299,7 +351,7 @@ class Shooting(Simulator):
     def _followed(
         self, commands: Mapping[int, Floats], before: Callable[[int], None] | None = None
     ) -> Floats:
-        """Step rows under commands, (steps, n_actions) each; return measurements, (steps, rows, c).
+        """Step rows under ``_commands`` of each; return measurements, (steps, rows, c).
 
         Before the measurements of a step, ``before`` is called with the number of the step.
         """
@@ -310,10 +362,13 @@ class Shooting(Simulator):
         for step in range(len(seen)):
             going = steps >= step
             if step:
-                now = np.zeros((len(self._batch), size))
+                now, within = np.zeros((len(self._batch), size)), dict[int, Floats]()
                 for row in np.flatnonzero(going).tolist():
-                    now[row] = commands[row][step - 1]
-                self._batch.advance(now, going)
+                    sent = commands[row][step - 1]
+                    now[row] = sent if sent.ndim == 1 else sent[-1]
+                    if sent.ndim > 1:
+                        within[row] = sent
+                self._batch.advance(now, going, within)
             if before is not None:
                 before(step)
             for table, rows in self._batch._by_structure(np.flatnonzero(going)):
@@ -326,7 +381,8 @@ class Shooting(Simulator):
         if self._set[0] == LOST:
             begin(world, self.world)
         self._set[0] = b"?"
-        self._write(world, scaled)
+        for setup in self._setups:
+            self._write(world, scaled, setup)
 
     def replay(
         self,
@@ -365,8 +421,9 @@ class Shooting(Simulator):
             chunk = scaled[first : first + len(self._batch)]
             sent = {row: self._commands(run, one, steps) for row, one in enumerate(chunk)}
             for row, one in enumerate(chunk):
-                self._write(self._batch.world(row), one)
-                self._batch.world(row).advance(sent[row][0])  # do() would begin the episode again
+                self._write(self._batch.world(row), one, run.do.items())
+                # do() would begin the episode again
+                self._batch.world(row).advance(run.commands[0])
 
             def before(step: int, first: int = first, sent: Mapping[int, Floats] = sent) -> None:
                 for i, world in ((first + row, self._batch.world(row)) for row in sent):

@@ -388,7 +388,7 @@ class SCM:
         for name, act in acts.items():
             is_bundle = name in self._bundles
             parts += act.divided(self._declared[name]).items() if is_bundle else [(name, act)]
-        done = {*self._done}
+        done, may_add = {*self._done}, self.adds_edges
         for name, act in parts:
             target = self.targets(name)[0]
             model._acts.pop(target, None)
@@ -397,28 +397,26 @@ class SCM:
                 alone = act.is_soft and act.lower is None
                 whole = act.on(self._beneath(target)) if alone else act
                 model._acts[target] = self._applied(name, whole)
+                may_add |= whole.root.computes or whole.root.draws
                 done.add(target)
             elif target in self._context:
-                model._acts[target] = self._context[target]
+                model._acts[target], may_add = self._context[target], True
         model._done = frozenset(done)
         if acts:
             vars(model).pop("structure", None)
-        model._find_order()
+        if may_add:
+            roots = [act.root for act in model._acts.values()]
+            model.adds_edges = any(
+                act.computes or (act.draws and act.follows(of)) for act, of, _ in roots
+            )
+        if model.adds_edges:  # cutting edges keeps every causal order valid
+            model._order = model.structure.order
         return model
 
     def _applied(self, name: str, act: Intervention) -> AppliedIntervention:
         """Return a checked intervention on one quantity, with those that it acts on."""
-        below = act.lower and self._applied(*act.lower)
+        below = act.lower and self._applied(*act.lower) if act.is_soft else None
         return AppliedIntervention(act, self._declared[act.whole(name)], below)
-
-    def _find_order(self) -> None:
-        """Find whether interventions add edges, and the causal order."""
-        roots = [act.root for act in self._acts.values()]
-        self.adds_edges = any(
-            act.computes or (act.draws and act.follows(of)) for act, of, _ in roots
-        )
-        if self.adds_edges:  # cutting edges keeps every causal order valid
-            self._order = self.structure.order
 
     def _as_context(self) -> Self:
         """Return the model whose interventions are a context, which further ones act on."""

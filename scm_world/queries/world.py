@@ -7,6 +7,7 @@ from abc import ABCMeta, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, final
 
 import networkx as nx
@@ -115,7 +116,6 @@ class Planned(CausalSystem):
         region, asked = as_region("space", space), request_of(do)
         super().reset(seed=seed, episode=episode)
         self._follow(_Schedule())
-        self.requested = {}
         context = do.context if isinstance(do, Plan) else ()
         if not (len(self._given) or context or has_times(asked)):
             return self.do(asked, space=space) if asked else None
@@ -138,13 +138,15 @@ class Planned(CausalSystem):
         makes of the variable now, and ``Natural`` shows that. Where a plan acts on the same
         variable at this instant, this intervention counts.
         """
+        system: Any = super()
         if not self.is_planned or has_times(request):
-            return self._doing(**options)(request)
+            return system.do(request, **options)  # type: ignore[no-any-return]
+        doing: Callable[..., Audit] = partial(system.do, **options)
         try:
             flat = self.model.named(flatten(request))
             acts = {name: self.model.accept(name, value) for name, value in flat.items()}
         except InterventionError:
-            return self._doing(**options)(request)  # which names every problem
+            return doing(request)  # which names every problem
         now, step = self._schedule, self.index
         plan = now.plan._replacing(
             {n: retimed(act, at=step) for n, act in acts.items()}, self.model
@@ -152,19 +154,9 @@ class Planned(CausalSystem):
         memory = now.memory.copy()
         for name in acts:
             memory.forget(name, step)
-        audit = plan._act(self, step, memory, self._doing(**options), acts)
+        audit = plan._act(self, step, memory, doing, acts)
         self._follow(now._replace(plan=plan, memory=memory))
-        return audit or self._doing(**options)({})
-
-    def _doing(self, **options: object) -> Callable[[Mapping[str, Any]], Audit]:
-        system: Any = super()
-
-        def do(request: Mapping[str, Any], **more: object) -> Audit:
-            audit: Audit = system.do(request, **options, **more)
-            self.requested = request
-            return audit
-
-        return do
+        return audit or doing({})
 
     def step(self, action: ArrayLike) -> None:
         """Advance one control step, after its planned interventions; see ``Simulation.step``.
@@ -212,7 +204,8 @@ class Planned(CausalSystem):
         if not self._may_act(step):
             return None
         memory = now.memory.copy()
-        audit = now.plan._act(self, step, memory, self._doing(space=now.space))
+        system: Any = super()
+        audit = now.plan._act(self, step, memory, partial(system.do, space=now.space))
         self._schedule = now._replace(memory=memory, acted=step)
         return audit
 
@@ -462,6 +455,10 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         *,
         noise: Any = None,
         window: int | None = None,
+        begins: Any = None,
+        held_out: float | None = None,
+        setups: Sequence[Mapping[str, object]] | None = None,
+        symmetric: bool = False,
         progress: Progress | None = None,
         search: Search | None = None,
     ) -> Fit:
@@ -490,6 +487,15 @@ class World(Planned, _System, Questions, metaclass=_Opener):
             window: Number of rows of a window; if None 50, or 10 where only these explain the
                 recording, which is a remark then. Longer windows determine more, and shorter ones
                 bear more disturbances, contacts and chaos.
+            begins: How the recording begins, where that was not measured: ``"rest"`` (velocities 0,
+                activations at what they follow, the first command, to 0.001), or values and
+                standard deviations by patterns of states, ``{"*.velocity": (0.0, 0.01)}``.
+            held_out: Share of the rows at the end of each run that are not fitted, but predicted:
+                ``fit.held_out``.
+            setups: The set-up of each of several recordings: values of parameters that were set for
+                it, ``[{}, {"weight.mass": 1.0}]``. A recording may carry its own: a column
+                ``do.weight.mass``, or arrays by name with ``"do": {"weight.mass": 1.0}``.
+            symmetric: Whether ranges [-a, a], such as those of forces, stay symmetric.
             progress: Called after each round of estimating the noise.
             search: What finds the next minimum of least squares; ``gauss_newton`` if None. See
                 ``scm_world.fit.Search``.
@@ -511,7 +517,9 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         """
         from scm_world.fit import fit
 
-        options: Any = {"noise": noise, "window": window, "progress": progress}
+        options: Any = {"noise": noise, "window": window, "begins": begins}
+        options |= {"held_out": held_out, "setups": setups, "progress": progress}
+        options |= {"symmetric": symmetric}
         options |= {} if search is None else {"search": search}
         return fit(self, recording, parameters, **options)
 
@@ -524,6 +532,8 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         most: int = 1,
         noise: Any = None,
         window: int | None = None,
+        begins: Any = None,
+        setups: Sequence[Mapping[str, object]] | None = None,
         progress: Progress | None = None,
     ) -> Deviation:
         """Find which parameter accounts for the deviation of a recording from this world.
@@ -542,6 +552,8 @@ class World(Planned, _System, Questions, metaclass=_Opener):
                 linearisation is fitted, then sets that differ from the best in one parameter.
             noise: See ``fit``.
             window: Number of rows of a window; 50 if None.
+            begins: See ``fit``.
+            setups: See ``fit``.
             progress: Called after each fit.
 
         Raises:
@@ -549,8 +561,8 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         """
         from scm_world.fit import explain
 
-        options: Any = {"most": most, "noise": noise, "window": window, "progress": progress}
-        return explain(self, recording, candidates, **options)
+        options: Any = {"noise": noise, "window": window, "begins": begins, "setups": setups}
+        return explain(self, recording, candidates, most=most, progress=progress, **options)
 
     def for_fit(self, recording: object) -> World:
         """Return the world that a fit computes: of equations, that of their step function."""

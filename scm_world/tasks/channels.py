@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from math import ceil, inf, prod
 from typing import Any, cast, final
 
@@ -14,12 +15,13 @@ import numpy as np
 from scm_world._arguments import real_number
 from scm_world._patterns import by_name
 from scm_world._types import Floats, Value, Values
+from scm_world._types import Integers as Places
 from scm_world.errors import UnknownOption
 from scm_world.geometry.numbers import njit, scalar
 from scm_world.graph import NoiseKey
 from scm_world.models import Model, ModelRow
 from scm_world.models.model import HELD, StateRow
-from scm_world.tasks.composition import Commands
+from scm_world.tasks.composition import Commands, Held
 from scm_world.variables import (
     Box,
     Exogenous,
@@ -32,8 +34,14 @@ from scm_world.variables import (
 )
 from scm_world.variables.reserved import CONTROL_INDEX
 
-STEPS = "a whole number of control steps, 0 or more", "Integers(least, most): drawn at every reset"
-SHARES = (*STEPS, "of a command any number of control steps, such as 1.5")
+STEPS = (
+    "a number of control steps, 0 or more, such as 2 or 1.5",
+    "Integers(least, most) or Box(least, most): drawn at every reset",
+)
+
+
+SAME = 1e-9
+"""Steps between two times that are the same."""
 
 
 @final
@@ -44,21 +52,22 @@ class Channel:
     With d control steps of delay at most, a spread s and a standard normal number e of each control
     step, an actuator applies ``u[t - delay] + s e``, and a sensor reads ``y[t - delay] + s e``. In
     the first control steps an actuator applies its idle control, and a sensor reads the first
-    value. Of a delay of 1.3 control steps of an actuator, ``0.7 u[t - 1] + 0.3 u[t - 2]`` arrives.
+    value. Of a delay of 1.3 control steps of an actuator, ``u[t - 2]`` acts in the first 0.3 of a
+    control step, then ``u[t - 1]``; see ``switched``.
 
     Attributes:
         of: The command, or the measured variable.
         acts: Whether it is an actuator.
         noise: Default of s, in the unit of the quantity; None without noise.
         delay: The steps it has, or the space that they are drawn from at every reset; None if 0. A
-            number with a fraction is a delay of real numbers.
+            number with a fraction, or a box, is a delay of real numbers.
         causes: The states and parameters that a readout is computed from.
     """
 
     of: ModelRow
     acts: bool
     noise: float | None
-    delay: float | Integers | None
+    delay: float | Integers | Box | None
     causes: tuple[str, ...] = ()
 
     @property
@@ -67,24 +76,31 @@ class Channel:
         return prod(self.of.shape)
 
     @property
-    def most(self) -> int:
-        """The longest delay, in control steps."""
-        return self.delay.high if isinstance(self.delay, Integers) else ceil(self.delay or 0)
+    def ends(self) -> tuple[float, float]:
+        """The shortest and the longest delay that it can have, in control steps.
+
+        They are those of a space. Without one, the shortest is 0, or 1 of a command with a delay of
+        1 or more, which reaches nothing at once; the longest one is a whole number.
+        """
+        if isinstance(self.delay, Integers | Box):
+            low, high = cast(tuple[float, float], (self.delay.low, self.delay.high))
+            return float(low), float(high)
+        return float(self.acts and (self.delay or 0) >= 1), float(ceil(self.delay or 0))
 
     @property
-    def least(self) -> int:
-        """The shortest delay: that of a space, or 1 of a command, which reaches nothing at once.
+    def most(self) -> int:
+        """How many past values are needed."""
+        return ceil(self.ends[1])
 
-        It is 0 of a command with a delay below 1.
-        """
-        if isinstance(self.delay, Integers):
-            return self.delay.low
-        return int(self.acts and (self.delay or 0) >= 1)
+    @property
+    def is_real(self) -> bool:
+        """Whether the delay may have a fraction."""
+        return isinstance(self.delay, float | Box)
 
     @property
     def varies(self) -> bool:
         """Whether the delay is a variable."""
-        return self.least < self.most
+        return self.most > 0 and not (self.acts and self.ends == (self.most, self.most))
 
     def name(self, what: str) -> str:
         """Return the name of one of its variables."""
@@ -118,28 +134,35 @@ class Channel:
             name, start = self.name("noise"), self.noise
             yield ModelRow(name, self.of.unit, (), start, 0.0, inf, doc, *effect)
         if self.varies:
-            name, ends = self.name("delay"), (float(self.least), float(self.most))
-            yield ModelRow(name, "1", (), ends[1], *ends, "Delay in control steps.", *effect)
+            row = self.name("delay"), "1", (), self.ends[1], *self.ends, "Delay in control steps."
+            yield ModelRow(*row, *effect)
 
     def delays(self, given: Mapping[str, Any]) -> Exogenous:
         """Declare the delay, with requested fields."""
-        drawn = self.delay if isinstance(self.delay, Integers) else None
-        real = isinstance(self.delay, float)
+        drawn = self.delay if isinstance(self.delay, Integers | Box) else None
+        default = self.ends[1] if self.is_real else self.most
         fields: dict[str, Any] = {
-            "default": self.delay if real else self.most,
+            "default": self.delay if isinstance(self.delay, float) else default,
             "distribution": drawn,
-            "bounds": (Box if real else Integers)(self.least, self.most),
-            "dtype": "real" if real else "integer",
+            "bounds": Box(*self.ends) if self.is_real else Integers(*map(int, self.ends)),
+            "dtype": "real" if self.is_real else "integer",
             "doc": f"Delay of {self.of.name} in control steps.",
         }
         return Exogenous(name=self.name("delay"), **fields | dict(given))
 
-    def remembers(self, row: StateRow) -> tuple[Parent, ...]:
-        """Return the causes of a state of ``held``."""
+    def remembers(
+        self, row: StateRow, moving: Mapping[str, tuple[Parent, ...]]
+    ) -> tuple[Parent, ...]:
+        """Return the causes of a state of ``held``; ``moving`` has those of each moved state."""
         if row.name != self.name("past"):
             return ()
-        older = (Parent(row.name, 1),) if self.most > 1 else ()
-        return (*older, *(Parent(name, 1) for name in self.causes or (self.of.name,)))
+        causes = self.causes or (self.of.name,)
+        found = [Parent(row.name, 1)] if self.most > 1 else []
+        found += [Parent(name, 1) for name in causes]
+        if self.is_real and not self.acts:  # it is read within a control step
+            found += [Parent(self.name("delay"), 1)]
+            found += [parent for name in causes for parent in moving.get(name, ())]
+        return tuple(dict.fromkeys(found))
 
     def readings(self) -> Iterator[Variable]:
         """Declare what a sensor reads."""
@@ -181,11 +204,12 @@ def channels_of(
         for name, value in given[option].items():
             where = f"{option}[{name!r}]"
             if option == "delay":
-                least, most = (value.low, value.high) if isinstance(value, Integers) else (0, value)
-                kinds = (int, np.integer, float) if name in acting else (int, np.integer)
-                right = isinstance(most, kinds) and not isinstance(most, bool)
-                if not right or not isinstance(value, Integers) <= most < inf or least < 0:
-                    raise UnknownOption(where, value, SHARES if name in acting else STEPS)
+                drawn = isinstance(value, Integers | Box)
+                least, most = (value.low, value.high) if drawn else (0, value)
+                kinds = (int, np.integer, float)
+                right = all(isinstance(n, kinds) and not isinstance(n, bool) for n in (least, most))
+                if not right or not 0 <= least <= most < inf:
+                    raise UnknownOption(where, value, STEPS)
             elif real_number(where, value) < 0.0:
                 raise UnknownOption(where, value, ("a standard deviation, not below 0",))
             elif name.endswith(".orientation"):
@@ -208,6 +232,28 @@ def with_held(system: Model, channels: Sequence[Channel]) -> Model:
     text = f"{system.digest}\0{[(row.name, row.shape) for row in held]}"
     digest = hashlib.sha256(text.encode()).hexdigest()
     return dataclasses.replace(system, states=(*own, *held), digest=digest)
+
+
+@lru_cache(maxsize=4096)
+def switched(delay: float, substeps: int) -> tuple[int, tuple[float, ...]]:
+    """Return how many control steps late a command is, and where in a control step it arrives.
+
+    With m whole control steps of delay, u[t - m - 1] acts until the fraction of the delay is over,
+    then u[t - m]. In the physics step in which that happens, both act in proportion to their time.
+
+    Args:
+        delay: In control steps.
+        substeps: How many physics steps a control step has.
+
+    Returns:
+        The number m, and the share of u[t - m - 1] in each physics step; empty if the delay ends
+        with a control step, to a billionth of a physics step.
+    """
+    late = delay * substeps
+    late = round(late) if abs(late - round(late)) < SAME else late
+    whole, rest = divmod(late, substeps)
+    shares = tuple(min(1.0, max(0.0, rest - step)) for step in range(substeps))
+    return int(whole), shares if rest else ()
 
 
 @final
@@ -236,13 +282,17 @@ class Channels(Commands):
             if one.of.name in self._read:
                 places[one.of.name], end = slice(end, end + one.size), end + one.size
         sources, errors = list[int](), list[int]()
+        self._shifted: list[tuple[str, range, bool]] = []  # sensors: delay, last value, quaternion
         for one in channels:
             for row in one.held():
-                at = places[row.name]
+                at, here = places[row.name], range(len(sources), len(sources) + one.size)
                 if row.name == one.name("error"):
-                    errors += range(len(sources), len(sources) + one.size)
+                    errors += here
                     sources += range(at.start, at.stop)
                     continue
+                if one.is_real and not one.acts:
+                    turns = one.of.name.endswith(".orientation")
+                    self._shifted.append((one.name("delay"), here, turns))
                 now = places[one.of.name]
                 sources += [*range(now.start, now.stop), *range(at.start, at.stop - one.size)]
         self._sources, self._errors = np.array(sources, int), np.array(errors, int)
@@ -260,35 +310,71 @@ class Channels(Commands):
         self._spreads = [one.name("noise") for one in noisy]
         self.noisy = {inputs[at]: slice(at, at + 1) for at in self._noisy}
 
-    def command(self, action: Floats, values: Values, vector: Floats, key: NoiseKey) -> Floats:
-        """Return the commands that arrive now, with noise, shape (n_commands,)."""
+    def command(
+        self, action: Floats, values: Values, vector: Floats, key: NoiseKey, substeps: int
+    ) -> Floats:
+        """Return the commands that arrive now, with noise; see ``Commands``."""
         sent = action.copy()
+        if self._samples(values, substeps):
+            sent = np.repeat(sent[None], substeps, axis=0)
         for index, name, past in self._late:
-            delay = float(values[name]) if name else 0.0
-            whole = int(delay)
+            whole, shares = switched(float(values[name]) if name else 0.0, substeps)
             if whole or not name:
-                sent[index] = vector[past + whole - 1]
-            if delay > whole:
-                sent[index] += (delay - whole) * (vector[past + whole] - sent[index])
+                sent[..., index] = vector[past + whole - 1]
+            if shares:
+                if sent.ndim == 1:
+                    sent = np.repeat(sent[None], substeps, axis=0)
+                change = vector[past + whole] - sent[:, index]
+                sent[:, index] += np.array(shares) * change
         if self._noisy:
             drawn = key.draw(Normal(), "actuators", (len(self._noisy),), {}, "noise")
-            sent[self._noisy] += drawn * [float(values[name]) for name in self._spreads]
+            sent[..., self._noisy] += drawn * [float(values[name]) for name in self._spreads]
         return sent
 
-    def held(self, action: Floats, values: Values, vector: Floats, key: NoiseKey) -> Floats | None:
+    def held(
+        self, action: Floats, values: Values, vector: Floats, key: NoiseKey, substeps: int
+    ) -> Held | None:
         """Return past values and errors as they are after the control step."""
         if not self._sources.size:
             return None
-        parts = [action, vector]
-        if self._read:
-            now: Any = values
-            now = now.copy()
-            now.evaluate(self._read)
-            parts += [np.ravel(now[name]) for name in self._read]
-        found: Floats = np.concatenate(parts)[self._sources]
+        size, given = vector.size, cast(Any, values)
+
+        def read(row: Floats) -> Floats:
+            parts = [action, row[:size]]
+            if self._read:
+                now = given.copy()
+                now.numbers[:size] = row[:size]
+                now.evaluate(self._read)
+                parts += [np.ravel(now[name]) for name in self._read]
+            found: Floats = np.concatenate(parts)[self._sources]
+            return found
+
+        found = read(vector)
         if self._errors.size:
             found[self._errors] = key.draw(Normal(), "sensors", self._errors.shape, {}, "noise")
-        return found
+        return Held(found, self._samples(values, substeps), read)
+
+    def _samples(self, values: Values, substeps: int) -> dict[int, tuple[Places, Floats]]:
+        """Return what sensors remember from within a control step; see ``Held``.
+
+        Of a delay with a fraction f, that is the value f control steps before the end: between two
+        physics steps on a straight line, a quaternion that of the nearest one.
+        """
+        found: dict[int, list[tuple[int, float]]] = {}
+        for name, places, turns in self._shifted:
+            delay = float(values[name])
+            if abs(delay - round(delay)) < SAME:
+                continue
+            since = (1.0 - delay % 1.0) * substeps
+            near = round(since)
+            step, share = divmod(near if turns or abs(since - near) < SAME else since, 1)
+            for after, part in ((int(step), 1.0), (int(step) + 1, share)):
+                if after and part:
+                    found.setdefault(after, []).extend((place, part) for place in places)
+        return {
+            step: (np.array([p for p, _ in each]), np.array([share for _, share in each]))
+            for step, each in found.items()
+        }
 
 
 # --- what a sensor reads --------------------------------------------------------------------------
@@ -300,14 +386,20 @@ def _noisy(value: Value, spread: Value, error: Value) -> Any:
 
 
 @njit(cache=True)
+def _steps(delay: Value, index: Value) -> int:
+    """Return which past value is read; in the first control steps there are fewer."""
+    return ceil(min(scalar(delay), scalar(index)) - SAME)
+
+
+@njit(cache=True)
 def _delayed(value: Value, delay: Value, past: Floats, index: Value) -> float:
-    steps = int(min(scalar(delay), scalar(index)))
+    steps = _steps(delay, index)
     return scalar(value) if steps == 0 else past[steps - 1]
 
 
 @njit(cache=True)
 def _delayed_vector(value: Floats, delay: Value, past: Floats, index: Value) -> Floats:
-    steps = int(min(scalar(delay), scalar(index)))
+    steps = _steps(delay, index)
     n = value.size
     return value.copy() if steps == 0 else past[(steps - 1) * n : steps * n].copy()
 

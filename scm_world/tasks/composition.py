@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from scm_world._types import Floats, Value, Values
+from scm_world._types import Integers as Places
 from scm_world.geometry.hulls import Hull
 from scm_world.geometry.numbers import njit, scalar
 from scm_world.graph import NoiseKey
@@ -41,6 +43,29 @@ class Entity:
     shape: str = "box"
 
 
+@dataclass(frozen=True, slots=True)
+class Held:
+    """What states that the world keeps by itself are after a control step.
+
+    Attributes:
+        numbers: Their values, as far as they are known, shape (k,).
+        samples: By a number of physics steps after which some are read: their places, and the
+            shares of these values in those that they then have, shape (m,) each.
+        read: Returns all of them, given a state of this control step.
+    """
+
+    numbers: Floats
+    samples: Mapping[int, tuple[Places, Floats]]
+    read: Callable[[Floats], Floats]
+
+    def see(self, step: int, vector: Floats) -> None:
+        """Read those that belong to the state after some physics steps."""
+        if step in self.samples:
+            places, shares = self.samples[step]
+            found = self.read(vector)[places]
+            self.numbers[places] = (1.0 - shares) * self.numbers[places] + shares * found
+
+
 class Commands(ABC):
     """The conversion of an action into a command of the backend, where they differ.
 
@@ -61,7 +86,9 @@ class Commands(ABC):
         return True
 
     @abstractmethod
-    def command(self, action: Floats, values: Values, vector: Floats, key: NoiseKey) -> Floats:
+    def command(
+        self, action: Floats, values: Values, vector: Floats, key: NoiseKey, substeps: int
+    ) -> Floats:
         """Return the command of one control step.
 
         Args:
@@ -69,18 +96,38 @@ class Commands(ABC):
             values: Those of everything that physics does not move.
             vector: The state.
             key: Where in the noise this control step draws.
+            substeps: How many physics steps the control step has.
 
         Returns:
-            Shape (n_commands,). It is valid until the next call.
+            Shape (n_commands,), or (substeps, n_commands) if it changes within the control step. It
+            is valid until the next call.
         """
 
-    def held(self, action: Floats, values: Values, vector: Floats, key: NoiseKey) -> Floats | None:
+    def held(
+        self, action: Floats, values: Values, vector: Floats, key: NoiseKey, substeps: int
+    ) -> Held | None:
         """Return what states that the world keeps by itself are after a control step.
 
         They are the last ones of the state; arguments are those of ``command``, before that step.
         None if there are no such states.
         """
         return None
+
+
+def parts(commands: Floats, also: Iterable[int] = ()) -> Iterator[tuple[int, Floats]]:
+    """Divide a control step where its commands change.
+
+    Args:
+        commands: Those of each physics step, shape (substeps, …).
+        also: Physics steps before which it is divided, too.
+
+    Yields:
+        A number of physics steps, and the commands that are held in them, shape (…).
+    """
+    changes = (commands[1:] != commands[:-1]).any(axis=tuple(range(1, commands.ndim)))
+    ends = {0, *(1 + np.flatnonzero(changes)).tolist(), *also, len(commands)}
+    for first, last in pairwise(sorted(ends)):
+        yield last - first, commands[first]
 
 
 class Composition:

@@ -339,24 +339,19 @@ class ModelTask(DeclaredTask):
             self.spaces[name] = {**self.spaces.get(name, {}), what: value}
         self.start = {name: self.start[name] for name in self.start if name not in parameters}
 
-    def delayed(self, steps: float) -> Self:
-        """Return the same task with all commands delayed by a number of control steps.
-
-        Raises:
-            UnknownOption: A command has a delay already.
-        """
-        own = {channel.of.name: channel for channel in self.channels if channel.acts}
-        late = [name for name, channel in own.items() if channel.most]
-        if late:
-            raise UnknownOption("delay", late, ("none of commands that have a delay already",))
-        rows = self.system.inputs
-        acting = (own.get(row.name, Channel(row, True, None, None)) for row in rows)
-        channels = [dataclasses.replace(one, delay=float(steps)) for one in acting]
+    def delayed(self, steps: Mapping[str, float]) -> Self:
+        """Return the same task with other delays of commands, in control steps by name."""
+        late = {name: float(value) for name, value in steps.items() if value}
+        own = {channel.of.name: channel for channel in self.channels}
+        for row in self.system.inputs:
+            if row.name in late:
+                channel = own.get(row.name, Channel(row, True, None, None))
+                own[row.name] = dataclasses.replace(channel, delay=late[row.name])
         other = self.at(self.plan, self.conventions, self.absent)
-        other.channels = (*channels, *(one for one in self.channels if not one.acts))
+        other.channels = tuple(own.values())
         other.system = with_held(self.system, other.channels)
         other.commands = Channels(other.channels, other.system)
-        other.delay = {**self.delay, **{row.name: float(steps) for row in rows}}
+        other.delay = {**self.delay, **late}
         if self.is_named:
             other.given = {**self.given, "delay": other.delay}
         return other
@@ -407,12 +402,16 @@ class ModelTask(DeclaredTask):
             *system.inputs,
             *own,
         )
-        late = {channel.of.name for channel in self.channels if channel.acts and channel.least}
+        late = {
+            channel.of.name for channel in self.channels if channel.acts and channel.ends[0] >= 1
+        }
         effects = {row.name: (row.always, row.contact) for row in acting if row.name not in late}
-        kept = {row.name: c.remembers(row) for c in self.channels for row in c.held()}
-        moving = [row for row in system.states if row.name not in kept]
+        held = {row.name for channel in self.channels for row in channel.held()}
+        moving = [row for row in system.states if row.name not in held]
         causes = causes_of(effects, {row.trees for row in moving})
         parents = {trees: coupled(*own) for trees, own in causes.items()}
+        causing = {row.name: parents[row.trees] for row in moving}
+        kept = {row.name: c.remembers(row, causing) for c in self.channels for row in c.held()}
         for moved in system.states:
             fields, begin = self._fields(moved, "default"), self.start.get(moved.name)
             if moved.name in kept:

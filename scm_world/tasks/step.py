@@ -48,7 +48,9 @@ class ProcessNoise(Commands):
         places = pairwise(np.cumsum(ends).tolist())
         self.noisy = {name: slice(*ends) for name, ends in zip(sources, places, strict=True)}
 
-    def command(self, action: Floats, values: Values, vector: Floats, key: NoiseKey) -> Floats:
+    def command(
+        self, action: Floats, values: Values, vector: Floats, key: NoiseKey, substeps: int
+    ) -> Floats:
         """Return the action and the noise of a control step, shape (n_commands,)."""
         drawn = [
             np.ravel(key.draw(source, name, shape, values, "process noise"))

@@ -203,6 +203,17 @@ class BackendConformance(ABC):
             assert np.array_equal(play(backend, commands, self.substeps), alone)
         assert np.array_equal(elsewhere(played, kind, scene, commands, self.substeps), alone)
 
+    def test_a_command_can_be_held_in_parts(self, backend: Backend) -> None:
+        """Commands that arrive within a control step divide it; the others do not notice."""
+        if not backend.capabilities.physics:
+            pytest.skip("nothing moves by itself")
+        start, commands = backend.snapshot(), self.commands(backend.structure, 10)
+        whole = play(backend, commands, self.substeps)
+        backend.restore(start)
+        parts = play(backend, np.repeat(commands, self.substeps, axis=0), 1)
+        floor = backend.capabilities.floor
+        assert np.allclose(parts[self.substeps - 1 :: self.substeps], whole, rtol=0.0, atol=floor)
+
     def test_contacts_are_those_of_the_last_step(self, scene: Scene) -> None:
         """Nothing touches before the first step; a change of the state does not change them."""
         with self.built(scene) as backend:
@@ -457,7 +468,7 @@ class BackendConformance(ABC):
 
     @pytest.mark.parametrize("n", [1, 7])
     def test_a_lost_state_is_that_of_its_scene(
-        self, scene: Scene, n: int, monkeypatch: Any, tmp_path: Path
+        self, scene: Scene, n: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     ) -> None:
         """It is named; all others are stepped, and a snapshot brings it back."""
         monkeypatch.chdir(tmp_path)  # engines may write a log
@@ -482,7 +493,7 @@ class BackendConformance(ABC):
 
     @pytest.mark.parametrize("together", [False, True])
     def test_an_explosion_is_an_error(
-        self, backend: Backend, together: bool, monkeypatch: Any, tmp_path: Path
+        self, backend: Backend, together: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     ) -> None:
         """A state that is not finite is never returned, also not from a batch."""
         monkeypatch.chdir(tmp_path)  # engines may write a log

@@ -291,7 +291,7 @@ class Hard(Intervention):
         value: Any = self.value
         if len(variable.shape) > 1 and np.size(value) == np.prod(variable.shape):
             value = np.reshape(value, variable.shape)
-        return Hard.of(_possible(variable, value))
+        return accepted(declared, variable, value)
 
     def describe(self) -> str:
         return np.array2string(np.asarray(self.value), precision=4, separator=", ", threshold=9)
@@ -517,15 +517,10 @@ def accepted(declared: Mapping[str, Variable], variable: Variable, value: object
         return value.checked(variable, declared)
     if type(value) is tuple:
         refuse_time(variable.name, value)
-    return Hard.of(_possible(variable, value))
-
-
-def _possible(variable: Variable, value: object) -> Value:
-    """Return a value within the bounds, as far as these follow no other variable."""
     number, bounds = coerce(variable, value), variable.bounds
     if bounds is not None and not bounds.parents() and not bounds.contains(number, {}):
         check_bounds(variable, number, {})
-    return number
+    return Hard.of(number)
 
 
 def refuse_time(name: str, act: object) -> None:

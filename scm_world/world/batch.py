@@ -6,6 +6,7 @@ import secrets
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from inspect import signature
+from types import MappingProxyType
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -24,6 +25,8 @@ from scm_world.errors import (
 from scm_world.graph import SCM, flatten
 from scm_world.graph.scm import request_of
 from scm_world.runs.processes import cores
+from scm_world.tasks import AnySource
+from scm_world.tasks.composition import Held, parts
 from scm_world.variables import Hard
 from scm_world.variables.distributions import word_of
 from scm_world.variables.interventions import has_times
@@ -67,7 +70,6 @@ class Batch:
     """
 
     @typed
-    @typed
     def __init__(
         self, worlds: Sequence[Simulation], *, threads: int | None = None, names: Iterable[str] = ()
     ) -> None:
@@ -110,15 +112,15 @@ class Batch:
         self._acts_alone = np.zeros(n, bool)
         self._origin: Snapshot | None = None  # before anything is drawn
         self._changes, self._is_closed = 0, False
-        self._options: Any = None  # of worlds that do not exist yet
-        self._make: Any = None  # makes an empty backend for one
+        self._options: Mapping[str, Any] | None = None  # of worlds that do not exist yet
+        self._make = partial(make_backend, first.backend.name)  # an empty backend for one
 
     @classmethod
     def _of(
         cls,
         kind: type[Simulation],
         num_worlds: int,
-        task: Any = "pushing",
+        task: AnySource = "pushing",
         *,
         threads: int | None = None,
         **options: Any,
@@ -148,7 +150,6 @@ class Batch:
         made = cls.__new__(cls)
         made._set_up(first, [None] * n, n, threads, names)
         made._options = {n: value for n, value in options.items() if n not in ("backend", "device")}
-        made._make = partial(make_backend, first.backend.name)
         made._engine = first.backend.batch.made_by(made._make, n, made._threads)
         return made
 
@@ -157,7 +158,7 @@ class Batch:
         world = self._worlds[row]
         if world is None:
             backend = self._engine.alone(row, self._make, is_built=bool(self._built[row]))
-            world = self._new(**self._options, backend=backend)
+            world = self._new(**(self._options or {}), backend=backend)
             done = self._done[row]
             if done is not None and self._origin is not None:
                 own = self._tables[done.compiled].row(row)
@@ -165,7 +166,7 @@ class Batch:
                 self._versions[row] = world.version
             world._closed |= self._is_closed
             self._worlds[row], self._exists[row] = world, True
-            self._done[row], self._acts_alone[row] = None, False
+            self._done[row], self._acts_alone[row] = None, world.acts_alone
         return world
 
     def _new(self, **options: Any) -> Simulation:
@@ -217,7 +218,7 @@ class Batch:
             found[row] = self._alone(row).index
         return found
 
-    def values(self, *, where: Any = None) -> dict[str, Value]:
+    def values(self, *, where: Mask | None = None) -> dict[str, Value]:
         """Return the present values of all variables that the selected worlds have.
 
         Args:
@@ -246,7 +247,7 @@ class Batch:
         self,
         *,
         seed: int | Sequence[int | None] | None = None,
-        where: Any = None,
+        where: Mask | None = None,
         do: Mapping[str, Any] | None = None,
         space: AnyRegion | None = None,
     ) -> Audits:
@@ -416,7 +417,7 @@ class Batch:
         self,
         request: Mapping[str, Any],
         *,
-        where: Any = None,
+        where: Mask | None = None,
         space: AnyRegion | None = None,
         on_refusal: Literal["raise", "skip"] = "raise",
     ) -> Audits:
@@ -526,9 +527,8 @@ class Batch:
         self._place[rows] = places
         self._where[rows] = one.where[places]
         self._changes += 1
-        commands = one.compiled.composition.commands
-        if commands is not None:
-            self._acts_alone[rows] = commands.applies(Rows(one.compiled, table.numbers[rows]))
+        commands, now = one.compiled.composition.commands, Rows(one.compiled, table.numbers[rows])
+        self._acts_alone[rows] = commands is not None and commands.applies(now)
         if self._names:
             table.evaluate(self._names, rows)
 
@@ -621,7 +621,7 @@ class Batch:
                 raise
         return found
 
-    def step(self, actions: ArrayLike, *, where: Any = None) -> None:
+    def step(self, actions: ArrayLike, *, where: Mask | None = None) -> None:
         """Advance some worlds one control step.
 
         Args:
@@ -674,10 +674,19 @@ class Batch:
         """Return the rows of some worlds by structure, with the numbers of these worlds."""
         return [(self._tables[kind[0]], members) for kind, members in self._groups(rows)]
 
-    def advance(self, commands: Floats, which: Mask | None = None) -> None:
-        """Advance worlds one control step, all if ``which`` is None; see ``Simulation.advance``.
+    def advance(
+        self,
+        commands: Floats,
+        which: Mask | None = None,
+        within: Mapping[int, Floats] = MappingProxyType({}),
+    ) -> None:
+        """Advance worlds one control step; see ``Simulation.advance``.
 
-        Commands are finite numbers within the bounds, shape (n, n_actions).
+        Args:
+            commands: Finite numbers within the bounds, shape (n, n_actions).
+            which: The worlds; all if None.
+            within: By number of a world, what acts in each physics step in place of its command,
+                shape (substeps, n_actions).
 
         Raises:
             NotReset: No episode has begun in one of the worlds.
@@ -688,20 +697,12 @@ class Batch:
         rows = self._all if which is None else np.flatnonzero(which)
         self._require_states(rows)
         groups, sent = self._groups(rows), commands
-        held: dict[int, Floats] = {}
-        there: Any = self._worlds
-        alone = [row for row in self._existing(rows) if there[row].acts_alone]
-        alone += rows[self._acts_alone[rows]].tolist()
+        held: dict[int, Held] = {}
+        late: Mapping[int, Floats] = within
+        alone = rows[self._acts_alone[rows]].tolist()
         if alone:
-            commands = commands.copy()
-            sent = np.zeros((len(self), self._first.structure.n_commands))
             others = np.setdiff1d(rows, alone)
-            if others.size:  # none, and a row of commands may be of another size
-                sent[others] = commands[others]
-            for row in alone:
-                commands[row], sent[row], numbers = self._decided(row, commands[row])
-                if numbers is not None:
-                    held[row] = numbers
+            commands, sent, late, held = self._decide(alone, others, commands, within)
         failed: EngineFailure | None = None
         for (compiled, substeps), members in groups:
             table = self._tables[compiled]
@@ -709,7 +710,7 @@ class Batch:
             kept = table.numbers[members if self._engine.may_refuse else members[:0]]
             table.advance(commands, members)
             try:
-                self._engine.step(members, sent, substeps, table.numbers)
+                self._step(members, sent, late, held, substeps, table.numbers)
             except BaseException as error:  # or Ctrl-C: the others were stepped
                 unmoved = error.unmoved if isinstance(error, EngineFailure) else ()
                 for place, row in enumerate(members.tolist()):
@@ -726,14 +727,67 @@ class Batch:
             finally:
                 for row in members.tolist() if held else ():
                     if row in held:
-                        there = slice(compiled.state_size - held[row].size, compiled.state_size)
-                        table.numbers[row, there] = held[row]
+                        numbers, size = held[row].numbers, compiled.state_size
+                        table.numbers[row, size - numbers.size : size] = numbers
         if failed is not None:
             raise failed
         for (compiled, _), members in groups:
             self._tables[compiled].evaluate(self._names, members)
 
-    def _decided(self, row: int, action: Floats) -> tuple[Floats, Floats, Floats | None]:
+    def _decide(
+        self, alone: list[int], others: Integers, commands: Floats, within: Mapping[int, Floats]
+    ) -> tuple[Floats, Floats, dict[int, Floats], dict[int, Held]]:
+        """Return actions, commands, those of each physics step, and what worlds keep; see above."""
+        commands, late, held = commands.copy(), dict(within), dict[int, Held]()
+        sent = np.zeros((len(self), self._first.structure.n_commands))
+        if others.size:  # none, and a row of commands may be of another size
+            sent[others] = commands[others]
+        for row in alone:
+            if row in within:
+                now = [self._decided(row, one)[1].copy() for one in within[row]]
+                late[row] = np.array([c if c.ndim == 1 else c[i] for i, c in enumerate(now)])
+            commands[row], found, after = self._decided(row, commands[row])
+            if found.ndim > 1:
+                late.setdefault(row, found.copy())
+            sent[row] = found if found.ndim == 1 else found[-1]
+            if after is not None:
+                held[row] = after
+        return commands, sent, late, held
+
+    def _step(
+        self,
+        members: Integers,
+        sent: Floats,
+        late: Mapping[int, Floats],
+        held: Mapping[int, Held],
+        substeps: int,
+        into: Floats,
+    ) -> None:
+        """Step the engine, part by part where commands change within the control step."""
+        mine = [row for row in members.tolist() if row in late] if late else []
+        if not mine:
+            self._engine.step(members, sent, substeps, into)
+            return
+        each = np.repeat(sent[None], substeps, axis=0)
+        each[:, mine] = np.stack([late[row] for row in mine], axis=1)
+        going, done, failed = members, 0, None
+        samples = {step for row in mine if row in held for step in held[row].samples}
+        for steps, part in parts(each, samples):
+            try:
+                self._engine.step(going, part, steps, into)
+            except EngineFailure as error:
+                if done:  # the control step was taken in part
+                    error.lost, error.unmoved = (*error.lost, *error.unmoved), ()
+                going = np.setdiff1d(going, (*error.lost, *error.unmoved))
+                failed = error.after(failed)
+            done += steps
+            for row in going.tolist() if done in samples else ():
+                if row in held:
+                    held[row].see(done, into[row])
+        if failed is not None:
+            raise failed
+
+    def _decided(self, row: int, action: Floats) -> tuple[Floats, Floats, Held | None]:
         """Compute what a control step does with an action; see ``Simulation._decided``."""
         world, done = self._worlds[row], self._done[row]
         if world is not None or done is None:
@@ -742,7 +796,7 @@ class Batch:
         key.step = int(own.numbers[done.compiled.clock])
         state = own.numbers[: done.compiled.state_size]
         commands: Any = done.compiled.composition.commands
-        given = action, own, state, key
+        given = action, own, state, key, self._kinds[self._kind[row]][1]
         return action, commands.command(*given), commands.held(*given)
 
     def _require_states(self, rows: Integers) -> None:
@@ -779,6 +833,7 @@ class Batch:
         world = self._alone(row)
         world._require_episode()
         self._kind[row] = self._number((world.compiled, world.substeps))
+        self._acts_alone[row] = world.acts_alone
         table = self._tables[world.compiled]
         if world.row.numbers.base is not table.numbers:
             world.move(table.row(row))
@@ -838,7 +893,7 @@ def located(error: ScmWorldError, index: int, what: str) -> ScmWorldError:
     return error
 
 
-def read_seeds(seed: Any, size: int) -> list[Any]:
+def read_seeds(seed: object, size: int) -> list[Any]:
     """Return the seed of each world; one seed counts up."""
     if seed is None:
         return [None] * size
@@ -873,18 +928,20 @@ def of_row(
     return found
 
 
-def read_mask(name: str, mask: Any, size: int) -> Mask:
+def read_mask(name: str, mask: object, size: int) -> Mask:
     """Return a checked boolean mask of worlds; all if None."""
     if mask is None:
         return np.ones(size, bool)
-    read = isinstance(mask, np.ndarray) and mask.shape == (size,) and mask.dtype == np.bool_
-    if not (read and mask.any()):
+    is_array = isinstance(mask, np.ndarray) and mask.dtype == np.bool_ and mask.shape == (size,)
+    if not is_array or not np.asarray(mask).any():
         allowed = (f"an array of {size} truth values, at least one of them true",)
         raise UnknownOption(name, mask, allowed)
     return np.array(mask)
 
 
-def read_actions(actions: Any, which: Mask | None, shape: tuple[int, int], what: str) -> Floats:
+def read_actions(
+    actions: ArrayLike, which: Mask | None, shape: tuple[int, int], what: str
+) -> Floats:
     """Return the checked actions of all worlds, of which ``which`` are stepped, in a shape.
 
     A world is called ``what`` in errors.

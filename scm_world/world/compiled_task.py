@@ -381,6 +381,12 @@ class CompiledTask(Vectors):
         return self.task.plan, self.task.absent
 
     @cached_property
+    def bounded(self) -> frozenset[str]:
+        """The variables whose bounds follow others."""
+        declared = self.model.variables
+        return frozenset(v.name for v in declared if v.bounds is not None and v.bounds.parents())
+
+    @cached_property
     def readouts(self) -> tuple[str, ...]:
         """The variables that are computed from measurements, without bundles."""
         measured = (v for v in self.model.variables if v.is_measured and v.equation is not None)
@@ -423,8 +429,9 @@ class CompiledTask(Vectors):
         And, grouped by size, names, streams, columns, lower ends and edges, the last three of shape
         (draws, size).
         """
-        if draws in self._boxes:
-            return self._boxes[draws]
+        found = self._boxes.get(draws)
+        if found is not None:
+            return found
         sizes = dict[int, list[Any]]()
         for name, source, stream in draws:
             box = self._box(name, source)
@@ -434,8 +441,8 @@ class CompiledTask(Vectors):
         groups = [(*zip(*group, strict=True),) for group in sizes.values()]
         if len(self._boxes) == BOXES:
             self._boxes.clear()
-        self._boxes[draws] = names, [(*g[:2], *map(np.stack, g[2:])) for g in groups]
-        return self._boxes[draws]
+        found = self._boxes[draws] = names, [(*g[:2], *map(np.stack, g[2:])) for g in groups]
+        return found
 
     def _box(self, name: str, source: Any) -> tuple[Integers, Floats, Floats] | None:
         """Return columns, lower ends and edges; None for a source that exceeds the bounds."""
@@ -595,7 +602,7 @@ def beginning(
 
 
 def beginnings(
-    compiled: CompiledTask, first: Rows, where: Any, key: Callable[[int], NoiseKey]
+    compiled: CompiledTask, first: Rows, where: NDArray[np.uint64], key: Callable[[int], NoiseKey]
 ) -> Floats:
     """Return the rows of several worlds at the beginning of episodes, shape (n, width).
 

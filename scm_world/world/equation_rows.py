@@ -84,7 +84,7 @@ class EquationBatch:
         """
         return self._gathered((self._one.model.declared(name).name,), self._all)[name]
 
-    def values(self, *, where: Any = None) -> dict[str, Value]:
+    def values(self, *, where: Mask | None = None) -> dict[str, Value]:
         """Return the present values of all variables in the selected worlds; see ``Batch``."""
         rows = np.flatnonzero(read_mask("where", where, len(self)))
         return self._gathered(tuple(self._one.model), rows)
@@ -137,7 +137,7 @@ class EquationBatch:
         self,
         *,
         seed: int | Sequence[int | None] | None = None,
-        where: Any = None,
+        where: Mask | None = None,
         do: Mapping[str, Any] | None = None,
         space: AnyRegion | None = None,
     ) -> Audits:
@@ -171,7 +171,7 @@ class EquationBatch:
         self,
         request: Mapping[str, Any],
         *,
-        where: Any = None,
+        where: Mask | None = None,
         space: AnyRegion | None = None,
         on_refusal: Literal["raise", "skip"] = "raise",
     ) -> Audits:
@@ -184,7 +184,7 @@ class EquationBatch:
         mask = read_mask("where", where, len(self))
         return self._change(mask, act, request_of(request), skips=on_refusal == "skip")
 
-    def step(self, actions: ArrayLike, *, where: Any = None) -> None:
+    def step(self, actions: ArrayLike, *, where: Mask | None = None) -> None:
         """Advance some worlds one control step.
 
         Args:

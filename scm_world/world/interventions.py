@@ -106,8 +106,8 @@ class Transaction:
     """A checked intervention, and the world after it for one noise key.
 
     The constructor accepts the request and mutilates the model; ``solve`` computes ``row`` for one
-    noise key; ``compare`` finds which parameters have ``changed``, the ``change`` of the backend,
-    and overlaps; ``held`` and ``kept`` return what remains. Arguments are those of ``feasible``.
+    noise key, which parameters have ``changed``, and the ``change`` of the backend; ``remains``
+    returns the model and what is pending. Arguments are those of ``feasible``.
 
     Attributes:
         base: The base in the requested structure.
@@ -147,7 +147,8 @@ class Transaction:
         there, by_hand = self.compiled.where, self.compiled.set_by_hand
         self.acts = {t: named for t, named in self.pending.items() if t in there}
         self._states = [t for t in self.acts if t in by_hand]
-        moving = self._refused_mechanisms()
+        computing = [t for t, (_, act) in self.acts.items() if act.root.computes]
+        moving = self._refused_mechanisms(computing) if computing else {}
         self.problems += {problem.variable: problem for problem in moving.values()}.values()
         self._impossible = {*moving}  # what has no possible value
         self._boxes: Any = (), ()  # draws from boxes that follow nothing; see ``boxes``
@@ -251,13 +252,12 @@ class Transaction:
         else:
             self._order = compiled.static_order(self._targets)
 
-    def _refused_mechanisms(self) -> dict[str, InterventionError]:
+    def _refused_mechanisms(self, computing: list[str]) -> dict[str, InterventionError]:
         """Return an error for each mechanism with a moving parent, or that fails now."""
         found: dict[str, InterventionError] = {}
         compiled, row = self.compiled, self.base.row
-        for target, (name, act) in self.acts.items():
-            if not act.root.computes:
-                continue
+        for target in computing:
+            name, act = self.acts[target]
             whole = compiled.model._applied(name, act)
             requested = whole.root.requested
             asked, parents = requested.name, whole.root.intervention.follows(requested)
@@ -297,10 +297,11 @@ class Transaction:
     # --- solving ------------------------------------------------------------------------------
 
     @np.errstate(all="ignore")  # values that are not finite are refused by name
-    def solve(self, key: NoiseKey) -> list[InterventionError]:
+    def solve(self, key: NoiseKey, now: Base) -> list[InterventionError]:
         """Solve for the parameters, then for the states; return the problems.
 
-        A mechanism is not called with invalid values of its parents.
+        A mechanism is not called with invalid values of its parents. Without problems, the
+        differences from the present ``now`` are ``changed`` and ``change``.
         """
         drawn, groups = self._boxes
         self._known: dict[str, tuple[str, Any]] = {}  # see ``settled``
@@ -313,18 +314,17 @@ class Transaction:
             found = uniforms(key, np.array(words, dtype=np.uint64), len(low[0]))
             numbers[columns] = low + edges * found
         self.row.unknown.difference_update(drawn)
-        declared, acts = self.compiled.model.declared, self.acts
+        bounded, acts = self.compiled.bounded, self.acts
         for name in self._order:
             if name in drawn:
                 continue
             asked, act = acts.get(name, (name, None))
-            bounds = declared(name).bounds
-            follows = bounds is not None and bool(bounds.parents())
-            constant = None if act is None or asked != name or follows else act.constant
+            free = act is not None and asked == name and name not in bounded
+            constant = act.constant if free else None  # type: ignore[union-attr]
             if constant is not None:
                 self.row[name] = constant  # it has been checked
             else:
-                self._compute(name, follows=follows)
+                self._compute(name, follows=name in bounded)
         carries = not self.compiled.carriers.isdisjoint(self._order)
         if (carries or self._states or self.base.fresh) and self._impossible.isdisjoint(
             self._deciding
@@ -332,7 +332,11 @@ class Transaction:
             self._set_states()
         if self.space is not None:
             self._check_space(self.space)
-        return self._as_asked() if self._wrong else []
+        if self._wrong:
+            return self._as_asked()
+        self.changed = now.row.differing(self.row)
+        self.change = difference(now, self.row, self.changed)
+        return []
 
     def _compute(self, name: str, *, follows: bool) -> None:
         """Compute a parameter after its parents; its bounds may depend on others."""
@@ -459,14 +463,6 @@ class Transaction:
 
     # --- bodies and repeated draws --------------------------------------------------------------
 
-    def compare(self, before: Base) -> list[Overlap]:
-        """Compute the changes; return overlaps deeper than those that physics left."""
-        self.changed = before.row.differing(self.row)
-        self.change = difference(before, self.row, self.changed)
-        if self.change is None:
-            return []
-        return overlaps(self.base, before, self.row, self.change, self.asked)
-
     def screened_draws(self, key: NoiseKey, attempts: range, draws: list[str]) -> Iterator[int]:
         """Yield the draws that pass the screening for overlaps, and the last one."""
         composition = self.compiled.composition
@@ -543,13 +539,13 @@ class Transaction:
         value = model.evaluate(target, self.row, self._key, model._applied(name, below))
         return act.on((target, Hard.of(value)))
 
-    def held(self) -> SCM:
-        """Return the model with the interventions that would be in force, draws as their values."""
-        drawn = dict([self.settled(target) for target in self._draws])
-        return self.model._with_interventions(drawn) if drawn else self.model
+    def remains(self) -> tuple[SCM, PendingInterventions]:
+        """Return the model that would be in force, and the interventions at this control step.
 
-    def kept(self) -> PendingInterventions:
-        """Return the interventions at this control step, draws as their values."""
+        Draws are their values there.
+        """
+        drawn = dict([self.settled(target) for target in self._draws])
+        model = self.model._with_interventions(drawn) if drawn else self.model
         by_hand, actions = self.compiled.set_by_hand, self.compiled.actions
         found: PendingInterventions = {}
         for target, named in self.pending.items():
@@ -560,10 +556,9 @@ class Transaction:
                 found[target] = self.settled(target)
             else:
                 found[target] = target, Hard.of(self.row[target])
-        removals = self.request.items()
-        return found | {
-            name: (name, act) for name, act in removals if getattr(act, "removes", False)
-        }
+        asked = self.request.items()
+        found |= {name: (name, act) for name, act in asked if getattr(act, "removes", False)}
+        return model, found
 
 
 # --- bodies ----------------------------------------------------------------------------------
@@ -663,10 +658,12 @@ def feasible(
         end = min(first + CHUNK, ATTEMPTS) if deciding else ATTEMPTS
         attempts = range(first, end if again else first + 1)
         for attempt in done.screened_draws(key, attempts, again) if again else attempts:
-            wrong = done.solve(replace(key, attempt=attempt) if attempt else key)
+            wrong = done.solve(replace(key, attempt=attempt) if attempt else key, now)
             if wrong:
                 raise_all(wrong)
-            problems = done.compare(now)
+            problems: list[Any] = []
+            if done.change is not None:
+                problems = overlaps(done.base, now, done.row, done.change, done.asked)
             composition = done.compiled.composition
             if composition.kept_clear and draws and not problems:  # of values, all are allowed
                 varied = done.compiled.reached(draws)
@@ -757,6 +754,8 @@ def _nearest(
     for _ in range(20):
         middle = 0.5 * (low + high)
         done = Transaction(structures, base, between(middle), None, key)
-        blocked = done.solve(key) or done.compare(now)  # outside the bounds, or in another body
+        blocked: Any = done.solve(key, now)  # outside the bounds, or in another body
+        if done.change is not None and not blocked:
+            blocked = overlaps(done.base, now, done.row, done.change, done.asked)
         low, high = (low, middle) if blocked else (middle, high)
     return between(low)[wanted]

@@ -15,7 +15,7 @@ from numba.core.errors import NumbaError
 from scm_world._types import ArrayLike, Floats, Integers, Value
 from scm_world.errors import FunctionFailure, ScmWorldError, in_one_line
 from scm_world.variables import Integers as WholeNumbers
-from scm_world.variables import Linear
+from scm_world.variables import Linear, Variable
 from scm_world.variables.mechanisms import PACKAGE, Stacked, Unboxed
 from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.world.kernels import begin_step, run, weighted_sum
@@ -233,7 +233,7 @@ class PythonStep:
         return found
 
 
-def wrong_value(variable: Any, value: Any) -> str:
+def wrong_value(variable: Variable, value: object) -> str:
     """Return the error in a value that the function of a variable returned, or an empty text."""
     if type(value) is float and isfinite(value) and variable.shape == () and not variable.bounds:
         return ""

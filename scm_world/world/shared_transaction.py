@@ -75,8 +75,8 @@ class SharedTransaction:
         structure: Structure,
         compiled: CompiledTask,
         now: Floats,
-        where: Any,
-        seeds: Any,
+        where: NDArray[np.uint64],
+        seeds: Sequence[int],
         below: tuple[SharedTransaction, Integers] | None = None,
     ) -> None:
         self.structures, self.structure, self.compiled = structures, structure, compiled
@@ -124,8 +124,7 @@ class SharedTransaction:
             known = name in compiled.static and name not in compiled.bundles
             if not known or name in self.structures.deciding or compiled.moves_bodies(name):
                 return False
-            bounds = model.declared(name).bounds
-            if model.targets(name) != (name,) or (bounds is not None and bounds.parents()):
+            if model.targets(name) != (name,) or name in compiled.bounded:
                 return False
         acts: dict[str, Any] = {}
         self._numbers: dict[str, Floats] = {}  # those of ``values``, as they are checked

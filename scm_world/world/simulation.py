@@ -27,7 +27,7 @@ from scm_world.graph import SCM, NoiseKey, flatten
 from scm_world.models import Difference, Parameters, Scene, Structure
 from scm_world.models.camera import Camera
 from scm_world.tasks import AnySource, Options, Task, make_task
-from scm_world.tasks.composition import Composition
+from scm_world.tasks.composition import Composition, Held, parts
 from scm_world.tasks.model import REWARD
 from scm_world.tasks.rewards import FRACTION, SUCCESS
 from scm_world.variables import Draw, Hard, Intervention, Subset
@@ -39,11 +39,19 @@ from scm_world.world.compiled_task import (
     beginning,
     check_functions,
 )
-from scm_world.world.interventions import Level, Transaction, difference, overlaps, renewed, stacked
+from scm_world.world.interventions import (
+    Level,
+    Transaction,
+    difference,
+    feasible,
+    overlaps,
+    renewed,
+    stacked,
+)
 from scm_world.world.mechanisms import Rows
 from scm_world.world.philox import CompiledNoise
 from scm_world.world.snapshot import Base, Snapshot
-from scm_world.world.structures import StructureCache
+from scm_world.world.structures import StructureCache, structures_of
 from scm_world.world.system import CausalSystem
 
 if TYPE_CHECKING:
@@ -151,7 +159,7 @@ class Simulation(CausalSystem):
         if shared is not None and replace(shared.options, steps=0) != options:
             name, allowed = "options of a world with these structures", (str(shared.options),)
             raise UnknownOption(name, options, allowed)
-        self.structures = shared or StructureCache(kind, options)
+        self.structures = shared or structures_of(kind, options)
         self.deciding, self.policies = self.structures.deciding, kind.policies
         self.options = self.structures.options
         self._checked = False
@@ -254,7 +262,8 @@ class Simulation(CausalSystem):
             check_functions(self.compiled, self.evaluate())
             self._checked = True
             warn_of_start(self.row, stacklevel=4)
-        self._base, self._base_step = self._step_base(at_start=True), self.index
+        self._base = Base(self.graph, self.row.copy(), self.structure, at_start=True)
+        self._base_step = self.index
 
     def _draw_nature(self) -> None:
         """Draw the random initial values of this episode."""
@@ -262,7 +271,7 @@ class Simulation(CausalSystem):
         compiled = self.structures.natural(key)
         if not compiled.random:
             return
-        row, now = beginning(compiled, key), self._step_base()
+        row, now = beginning(compiled, key), Base(self.graph, self.row, self.structure)
         changed = now.row.differing(row)
         change = difference(now, row, changed)
         if change is not None:
@@ -413,12 +422,20 @@ class Simulation(CausalSystem):
         if self.acts_alone:
             command, sent, held = self._decided(command)
         row.prepare()
+        done = 0
         try:
-            self.backend.step(sent, self.substeps)
+            if sent.ndim == 1:
+                self.backend.step(sent, self.substeps)
+            for steps, part in parts(sent, held.samples if held else ()) if sent.ndim > 1 else ():
+                self.backend.step(part, steps)
+                done += steps
+                if held is not None and done in held.samples:
+                    self.backend.read(self.state)
+                    held.see(done, self.state.vector)
         except EngineFailure as error:
             left, vector = self.compiled.empty_state(), self.state.vector
             self.backend.read(left)
-            if not error.lost and np.isfinite(left.vector).all():  # the step was not taken
+            if not (done or error.lost) and np.isfinite(left.vector).all():  # no step was taken
                 raise
             text = str(error)
             if vector.size:
@@ -433,14 +450,15 @@ class Simulation(CausalSystem):
         row.advance(command)
         self.backend.read(self.state)
         if held is not None:
-            self.state.vector[-held.size :] = held
+            self.state.vector[-held.numbers.size :] = held.numbers
 
-    def _decided(self, action: Floats) -> tuple[Floats, Floats, Floats | None]:
+    def _decided(self, action: Floats) -> tuple[Floats, Floats, Held | None]:
         """Compute what a control step does with an action, if the world ``acts_alone``.
 
         Returns:
             The action after interventions on actions; the backend's command, valid until the next
-            call; and the states that are kept here as they are after the step, None without any.
+            call, see ``Commands.command``; and the states that are kept here as they are after the
+            step, None without any.
         """
         held, key = self._held_actions, self.noise_key(self.index)
         if held:
@@ -453,7 +471,7 @@ class Simulation(CausalSystem):
         if not self._translates:
             return action, action, None
         commands: Any = self.composition.commands
-        given = action, self.row, self.state.vector, key
+        given = action, self.row, self.state.vector, key, self.substeps
         return action, commands.command(*given), commands.held(*given)
 
     # --- interventions ------------------------------------------------------------------------
@@ -491,25 +509,26 @@ class Simulation(CausalSystem):
         if not self.has_begun or self._lost:
             self.require_state()
         problems: list[InterventionError] = []
-        flat, before = self.model.named(flatten(request, problems), problems), self._step_base()
+        named = self.compiled.model.named
+        flat = named(flatten(request, problems), problems)
+        before = Base(self.graph, self.row.copy(), self.structure)
         base = self.base or before
         drawn, key = base.drawn, self.noise_key(self.index)
         if any(isinstance(a, Intervention) and (a.is_soft or a.draws) for a in flat.values()):
             initial = base.row.compiled.random if base.at_start else ()
             flat, drawn = renewed(flat, drawn, initial)
-            named = (self.model.named(one.request) for one in levels[:-1])
-            lower = [renewed(one, base.drawn, initial)[0] for one in named]
+            lower = [renewed(named(one.request), base.drawn, initial)[0] for one in levels[:-1]]
             draws = [one.draws for one in levels] or [{}]
             levels = [*map(Level, (*lower, flat), draws)]
         region = self.variables_space if space is None else as_region("space", space)
-        levels = levels or (Level(flat, {}),)
-        done = stacked(self.structures, base, before, levels, region, key, problems)
-        pending = done.kept()
-        audit = self._commit(done, before, flat, check, at_start=base.at_start)
+        solved: Any = partial(stacked if levels else feasible, self.structures, base, before)
+        done: Transaction = solved(levels or flat, region, key, problems)
+        model, pending = done.remains()
+        audit = self._commit(done, model, before, flat, check, at_start=base.at_start)
         rest = (base.structure, pending, drawn, base.at_start)
         self._base = Base(base.model, base.row, *rest)
         self._base_step = self.index - self._offset
-        self.last = done
+        self.last, self.requested = done, request
         return audit
 
     @property
@@ -529,7 +548,7 @@ class Simulation(CausalSystem):
         self.requested = one.request(place)
         if self.index == key.step:
             base, _, self.last = one.done(place)
-            rest = (base.structure, self.last.kept(), one.drawn, base.at_start)
+            rest = (base.structure, self.last.remains()[1], one.drawn, base.at_start)
             self._base = Base(base.model, base.row, *rest)
 
     def _drawn(self, name: str, act: Any) -> dict[str, tuple[str, Any]]:
@@ -544,12 +563,10 @@ class Simulation(CausalSystem):
         parts, key = act.divided(model.declared(name)).items(), replace(key, kept=None)
         return {model.target(n): (n, one.settled(model.declared(n), key)) for n, one in parts}
 
-    def _step_base(self, *, at_start: bool = False) -> Base:
-        return Base(self.graph, self.row.copy(), self.structure, at_start=at_start)
-
     def _commit(
         self,
         done: Transaction,
+        model: SCM,
         before: Base,
         request: Mapping[str, Any],
         check: Callable[[], object] | None,
@@ -581,10 +598,10 @@ class Simulation(CausalSystem):
                     remarks = backend.capabilities.remarks(backend, old)
             clock = done.row.numbers[compiled.clock]
             if change is None and not done.changed and clock == index and self.compiled is compiled:
-                self._adopt_model(done.held())
+                self._adopt_model(model)
                 self.version += 1
             else:
-                self._adopt(done.held(), done.row, done.changed, structure)
+                self._adopt(model, done.row, done.changed, structure)
                 self._offset += self.index - index
                 if at_start:
                     self.row.remember()
@@ -650,12 +667,13 @@ class Simulation(CausalSystem):
         self.substeps = physics_steps(self.options, structure)
 
     def _adopt_model(self, model: SCM) -> None:
-        self.graph, held = model, model.interventions
-        self._held_actions = tuple(name for name in self.compiled.actions if name in held)
-        self.holds_actions = bool(self._held_actions)
+        acts = {name: model._act_on(name) for name in self.compiled.actions}
+        roots = {name: act.root for name, act in acts.items() if act is not None}
+        self.graph, self._held_actions = model, tuple(roots)
+        self.holds_actions = bool(roots)
         self.acts_alone = self._translates or self.holds_actions
-        roots = [model._applied(name, held[name]).root for name in self._held_actions]
-        self._inputs = tuple(p.name for of in roots for p in of.intervention.follows(of.requested))
+        follow = (of.intervention.follows(of.requested) for of in roots.values())
+        self._inputs = tuple(p.name for parents in follow for p in parents)
 
     # --- state ------------------------------------------------------------------------
 

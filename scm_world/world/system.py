@@ -250,6 +250,7 @@ class CausalSystem(ABC):
         else:
             self.episode = self.episode + 1
         self._begin()
+        self.requested = {}
         return self.do(request, space=space) if request else None
 
     def _noise_of(self, seed: Any, episode: Any) -> tuple[Any, Any]:

@@ -295,7 +295,7 @@ def test_a_delay_of_commands_is_fitted(world: sw.World) -> None:
 
 
 def test_a_fitted_delay_is_one_of_the_commands_of_the_fitted_world(world: sw.World) -> None:
-    """It replays the recording; a second delay of the commands is refused."""
+    """It replays the recording; beside a delay that commands have, it is refused."""
     late = sw.World(PENDULUM, delay={"motor.control": 1.4})
     fit = world.fit(recording := late.rollout("random", seed=1, steps=60), "delay")
     assert fit.values["delay"] == pytest.approx(0.028, abs=1e-4)
@@ -304,11 +304,16 @@ def test_a_fitted_delay_is_one_of_the_commands_of_the_fitted_world(world: sw.Wor
     fit.world.reset(seed=0)
     assert float(fit.world["motor.control_delay"]) == pytest.approx(1.4, abs=5e-3)
     later = sw.World(PENDULUM, delay={"motor.control": 2.4})
-    run = later.rollout("random", seed=1, steps=30)
+    sent = np.random.default_rng(0).uniform(-1.0, 1.0, (30, 1))
+    sent[:3] = 0.0  # the first command, which held before
+    run = later.rollout(sent, steps=30)
     given = {"time": 0.02 * np.arange(31), "motor.control": run.actions[:, 0]}
-    second = late.fit({**given, "hinge.position": run["hinge.position"]}, "delay")
-    with pytest.raises(UnknownOption, match="have a delay already"):
-        _ = second.world
+    table = {**given, "hinge.position": run["hinge.position"]}
+    with pytest.raises(NotIntervenable, match=r"have already; fit motor\.control_delay"):
+        late.fit(table, "delay")
+    own = sw.World(PENDULUM, delay={"motor.control": sw.Box(0.0, 3.0)})
+    second = own.given({"motor.control_delay": 1.0}).fit(table, "motor.control_delay")
+    assert second.values["motor.control_delay"] == pytest.approx(2.4, abs=1e-4)
 
 
 def test_the_size_of_a_body_that_lies_is_fitted() -> None:
@@ -649,10 +654,11 @@ def test_the_command(damped: pd.DataFrame, tmp_path: Path, monkeypatch: Any) -> 
     words = ["fit", "pendulum.xml", "run.csv", "more.parquet", "--out", "out"]
     more = ["--parameters", "*.damping", "--noise", "hinge.position=0.001"]
     asked = ["--suggest", "1", "--steps", "40", "--limits", "hinge.position=-2,2"]
-    asked += ["--do", "pole.mass=0.3", "--at", "10", "--run", "1"]
+    asked += ["--do", "pole.mass=0.3", "--at", "10", "--run", "1", "--predict", "run.csv"]
+    asked += ["--begins", "hinge.velocity=0,1", "--held-out", "0.3"]
     done = CliRunner().invoke(app, [*words, *more, *asked], catch_exceptions=False)
     assert done.exit_code == 0, done.output
-    assert "2 runs of 192 rows, 3.8 s, 1 measured column" in done.output
+    assert "2 runs of 135 rows, 2.66 s, 1 measured column" in done.output
     assert "hinge.damping" in done.output
     assert "experiment 1: 40 control steps (0.8 s)" in done.output
     assert "with pole.mass=0.3 from 10 on" in done.output
@@ -661,6 +667,10 @@ def test_the_command(damped: pd.DataFrame, tmp_path: Path, monkeypatch: Any) -> 
     found = json.loads(Path("out/result.json").read_text())
     assert found["fit"][0]["value"] == pytest.approx(0.02, rel=0.02)
     assert found["backend"] == "mujoco"
+    assert found["replay"][0]["fit"] < 0.3 * found["replay"][0]["constant"]
+    assert {*found["predictions"]} == {"run.csv", "held out"}
+    assert found["predictions"]["run.csv"][0]["skill"] > 0.9
+    assert "hinge.velocity at the start" in found["noise"]
     assert {"seed", "versions", "noise", "remarks"} <= {*found}
     assert {*(path.name for path in Path("out").iterdir())} == {
         *("result.json", "residuals.csv", "fit.png", "experiment-1.csv", "counterfactual.csv")

@@ -223,7 +223,6 @@ TURN = {"outcomes": ["tip.orientation"]}
         ({"noise": {"hinge.position": -0.1}}, UnknownOption, "not below 0"),
         ({"noise": {"tip.orientation": 0.1}, **TURN}, UnknownOption, "quaternions"),
         ({"delay": {"*.control": -1}}, UnknownOption, "0 or more"),
-        ({"delay": {"*.position": 1.5}}, UnknownOption, "whole number"),
         ({"delay": 2}, UnknownOption, "a dictionary by name"),
     ],
 )

@@ -31,6 +31,7 @@ from scm_world.errors import (
 from scm_world.models import Difference
 from scm_world.variables import Draw, Normal, Null, Scale, Shift
 from scm_world.world.interventions import feasible
+from scm_world.world.snapshot import Base
 
 NAN = float("nan")
 HUGE = 1e308
@@ -223,7 +224,7 @@ def test_an_engine_is_told_the_difference_of_the_scenes(backend: str, task: str)
         world = begin(backend, task)
         request = {name: other(world, name)}
         key = world.noise_key(world.index)
-        base = world._step_base()
+        base = Base(world.graph, world.row.copy(), world.structure)
         done = feasible(world.structures, base, base, request, None, key)
         then = done.compiled.scene(done.row)
         now = world.scene()

@@ -15,6 +15,7 @@ from scm_world.variables.distributions import Noise, word_of
 from scm_world.world import interventions
 from scm_world.world.interventions import Transaction
 from scm_world.world.philox import philox
+from scm_world.world.snapshot import Base
 
 
 def mean(color: Any) -> float:
@@ -56,9 +57,9 @@ def test_what_no_draw_changes_is_refused_without_drawing_again(
     attempts: list[int] = []
     solve = Transaction.solve
 
-    def counted(done: Transaction, key: NoiseKey) -> Any:
+    def counted(done: Transaction, key: NoiseKey, now: Base) -> Any:
         attempts.append(key.attempt)
-        return solve(done, key)
+        return solve(done, key, now)
 
     world = World(task, backend="fake")
     world.reset(seed=1)
@@ -150,9 +151,9 @@ def test_draws_are_looked_at_together_and_the_same_one_is_taken(
     solved: list[int] = []
     solve = Transaction.solve
 
-    def noted(done: Transaction, key: NoiseKey) -> Any:
+    def noted(done: Transaction, key: NoiseKey, now: Base) -> Any:
         solved.append(key.attempt)
-        return solve(done, key)
+        return solve(done, key, now)
 
     monkeypatch.setattr(Transaction, "solve", noted)
     monkeypatch.setattr(interventions, "ATTEMPTS", 200)

@@ -15,9 +15,9 @@ from scm_world.world.mechanisms import Rows
 
 pytest.importorskip("torch")
 
-import torch  # noqa: E402 # see above
+import torch  # see above
 
-from scm_world.world.tensors import TensorRows  # noqa: E402
+from scm_world.world.tensors import TensorRows
 
 N = 200
 READY = {name: task.ready_terms for name, task in TASKS.items()}

@@ -48,6 +48,7 @@ from scm_world.queries.experiments.probes import (
 )
 from scm_world.queries.local import contact_terms, holds
 from scm_world.queries.plans import Plan
+from scm_world.tasks.composition import parts
 from scm_world.variables import Noise
 from scm_world.variables.moments import earlier
 from scm_world.world import CausalSystem, CompiledModel, Equations, Simulation
@@ -228,17 +229,19 @@ class Paired:
 
         def after(command: Floats) -> Values:
             world.restore(probe.snapshot)
-            world.backend.step(command, world.substeps)
+            for steps, part in parts(np.broadcast_to(command, (world.substeps, command.shape[-1]))):
+                world.backend.step(part, steps)
             state = world.backend.read()
             return {name: state.vector[at] for name, at in state.layout.slices.items()}
 
         acted, sent, _ = world._decided(world.compiled.clipped(probe.action))
         command, key = sent.copy(), world.noise_key(world.index + OTHER)
-        others = commands.command(acted, world.row, world.state.vector, key).copy()
+        given = acted, world.row, world.state.vector, key, world.substeps
+        others = commands.command(*given).copy()
         base = after(command)
         for noise, place in commands.noisy.items():
             changed = command.copy()
-            changed[place] = others[place]
+            changed[..., place] = others[..., place]
             for state, value in after(changed).items():
                 if gap(value, base[state]) > 0.0:
                     yield noise, state, value, base[state]

@@ -100,7 +100,9 @@ class RobotCommands(Commands):
         """Return whether fingertips are commanded, or the actuators have noise."""
         return self._by_tips or values[ACTUATOR_NOISE] > 0.0
 
-    def command(self, action: Floats, values: Values, vector: Floats, key: NoiseKey) -> Floats:
+    def command(
+        self, action: Floats, values: Values, vector: Floats, key: NoiseKey, substeps: int
+    ) -> Floats:
         """Add the noise, then find the joint positions of fingertips, shape (9,)."""
         noise = float(values[ACTUATOR_NOISE])
         if noise > 0.0:

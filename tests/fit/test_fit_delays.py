@@ -1,0 +1,78 @@
+"""Delays of commands that end within a control step, fitted to recordings of plain MuJoCo."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+import scm_world as sw
+from scm_world.fit import Fit
+
+STEPS, SUBSTEPS = 60, 10
+KEPT = {"s": 2, "m": 4}  # past commands, in control steps
+ARM = """
+<mujoco model="arm">
+  <option timestep="0.002" integrator="implicitfast"/>
+  <worldbody>
+    <body name="arm">
+      <joint name="j" axis="0 1 0" damping="0.1" armature="0.01"/>
+      <geom type="capsule" fromto="0 0 0 0.4 0 0" size="0.02" mass="0.6"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <position name="s" joint="j" kp="30" kv="1" ctrlrange="-2 2"/>
+    <motor name="m" joint="j" ctrlrange="-3 3"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def recorded(seed: int, delays: tuple[float, float]) -> dict[str, np.ndarray]:
+    """Record MuJoCo with another gain and with delays in physics steps, by hand."""
+    rng, model = np.random.default_rng(seed), mujoco.MjModel.from_xml_string(ARM)
+    model.actuator_gainprm[0, 0], model.actuator_biasprm[0, 1] = 38.0, -38.0
+    data, seen = mujoco.MjData(model), []
+    sent = np.repeat(rng.uniform([-1, -2], [1, 2], (10, 2)), STEPS // 10, axis=0)
+    for step in range(STEPS):
+        seen.append(data.qpos[0] + 1e-3 * rng.normal())
+        for i in range(SUBSTEPS):
+            late = [(SUBSTEPS * step + i - delay) // SUBSTEPS for delay in delays]
+            data.ctrl[:] = [sent[max(0, int(at)), which] for which, at in enumerate(late)]
+            mujoco.mj_step(model, data)
+    columns = {"s.control": sent[:, 0], "m.control": sent[:, 1], "j.position": np.array(seen)}
+    return {"time": 0.02 * np.arange(STEPS), **columns}
+
+
+def covers(fit: Fit, truth: dict[str, float]) -> int:
+    """Return how many intervals have their true value; all values are determined and near."""
+    rows = fit.table.set_index("parameter")
+    assert rows.determined.all()
+    for name, value in truth.items():
+        assert rows.value[name] == pytest.approx(value, rel=0.01)
+    return sum(bool(rows.low[n] <= value <= rows.high[n]) for n, value in truth.items())
+
+
+def test_a_delay_that_ends_within_a_control_step_is_recovered() -> None:
+    """So is the gain, which a mean of two commands over the control step would change."""
+    with sw.World(ARM, control_dt=0.02) as world:
+        found = 0
+        for seed in (1, 3, 5):
+            fit = world.fit(recorded(seed, (14, 14)), ["s.kp", "delay"])
+            found += covers(fit, {"s.kp": 38.0, "delay": 0.028})
+    assert found >= 5
+
+
+def test_each_command_has_its_own_delay() -> None:
+    """The fitted world has them, and replays the recording."""
+    run = recorded(2, (14, 33))
+    names = ["s.kp", "s.control_delay", "m.control_delay"]
+    with sw.World(ARM, control_dt=0.02) as world:
+        fit = world.fit(run, names)
+        assert covers(fit, dict(zip(names, (38.0, 1.4, 3.3), strict=True))) >= 2
+        assert [*fit.table.unit[1:]] == ["1", "1"]
+        sent = np.stack([run["s.control"], run["m.control"]], axis=1)[:-1]
+        past = {f"{n}.control_past": np.full(k, run[f"{n}.control"][0]) for n, k in KEPT.items()}
+        again = fit.world.rollout(sent, seed=0, steps=STEPS - 1, do=past)
+        assert again["m.control_delay"][0] == fit.values["m.control_delay"]
+        assert np.abs(again["j.position"] - run["j.position"]).max() < 6e-3
