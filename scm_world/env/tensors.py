@@ -119,7 +119,7 @@ class TensorEnvs:
         except EngineFailure as error:
             self.why_not = str(error)
             return
-        lead, (compiled, self._substeps) = envs._lead, self._kinds[0][0]
+        lead, (compiled, self._substeps) = envs._inner[0], self._kinds[0][0]
         table = envs._batch._tables[compiled]
         self._rows = TensorRows(table, envs._names, self._engine.device, self.copies)
         observer, where = lead.observer, compiled.where
@@ -161,7 +161,7 @@ class TensorEnvs:
     def _reason(self, rows: Integers) -> str:
         """Return why some environments cannot be stepped on the device."""
         envs = self._envs
-        observer = envs._lead.observer
+        observer = envs._inner[0].observer
         kinds = envs._batch._groups(rows)
         part = observer.parts["observation"]
         if len(kinds) > 1 or kinds[0][0] != self._kinds[0][0]:
