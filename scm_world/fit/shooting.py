@@ -371,7 +371,7 @@ class Shooting(Simulator):
                 self._batch.advance(now, going, within)
             if before is not None:
                 before(step)
-            for table, rows in self._batch._by_structure(np.flatnonzero(going)):
+            for table, rows in self._batch.by_structure(np.flatnonzero(going)):
                 seen[step, rows] = table.numbers[np.ix_(rows, self._places)]
         return seen
 
