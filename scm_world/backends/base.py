@@ -7,6 +7,7 @@ A backend holds one scene. It knows bodies, parameters and states, and nothing a
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, TypeVar, final
@@ -231,6 +232,21 @@ class Scenes(ABC):
 
     def tensor(self, which: Integers, name: str) -> Any:
         """Return a state of some scenes where the engine has it; see ``Backend.tensor``."""
+        raise EngineFailure(NO_DEVICE, getattr(self, "name", type(self).__name__))
+
+    def resident(self, which: Integers, copies: Counter[str]) -> Any:
+        """Let the states of scenes stay where the engine has them from step to step.
+
+        Args:
+            which: The scenes, all that there are.
+            copies: Counts the bytes that are copied between host and device, by reason.
+
+        Returns:
+            What steps them there; see ``scm_world.backends.warp.resident.Resident``.
+
+        Raises:
+            EngineFailure: The engine has no states on a device, or not these together.
+        """
         raise EngineFailure(NO_DEVICE, getattr(self, "name", type(self).__name__))
 
     @abstractmethod

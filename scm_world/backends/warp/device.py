@@ -398,6 +398,12 @@ class Engine:
                 self._graphs = {}
 
     def step(self, substeps: int) -> None:
+        """Take some physics steps in all worlds, and copy their states to the host."""
+        self.launch(substeps)
+        for column in self.state.values():
+            column.pull()
+
+    def launch(self, substeps: int) -> None:
         """Take some physics steps in all worlds: a captured graph, on a GPU of all of them."""
         self.launched += 1
         with wp.ScopedDevice(self.base.device):
@@ -409,8 +415,6 @@ class Engine:
                 self._graphs[once] = capture.graph
             for _ in range(substeps // once):
                 wp.capture_launch(self._graphs[once])
-        for column in self.state.values():
-            column.pull()
 
     def grow(self, over: Integers) -> tuple[bool, list[int]]:
         """Make more memory after an overflow.
