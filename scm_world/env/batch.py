@@ -218,7 +218,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         if not len(rows):
             return
         commands = self._commanded(rows, actions)
-        before = self._batch._by_structure(rows) if self._inner[0].truncates_failures else []
+        before = self._batch.by_structure(rows) if self._inner[0].truncates_failures else []
         kept = [table.numbers[members] for table, members in before]
         moved = rows
         try:
@@ -236,7 +236,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
             self._rewards[failed] = 0.0
             self._terminations[failed], self._truncations[failed] = False, True
             moved = np.setdiff1d(rows, failed)
-        for table, members in self._batch._by_structure(moved):
+        for table, members in self._batch.by_structure(moved):
             if moved is not rows:
                 table.evaluate(self._names, members)
             self._take(table, members)
@@ -279,7 +279,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         how = self._inner[0].actions
         if how.relative:
             actions = np.array(actions)
-            for table, members in self._batch._by_structure(rows):
+            for table, members in self._batch.by_structure(rows):
                 offset = (table.actions if how.reads is None else table[how.reads])[members]
                 if how.reads is None and self._inner[0].world.options.action_mode == JOINTS:
                     # Where joints were put since the last command, actions are relative to them.

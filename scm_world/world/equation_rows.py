@@ -24,6 +24,7 @@ from scm_world.world.batch import (
     of_row,
     read_actions,
     read_mask,
+    read_numbers,
     read_seeds,
     values_of_each,
 )
@@ -135,20 +136,22 @@ class EquationBatch:
         self,
         *,
         seed: int | Sequence[int | None] | None = None,
+        episode: int | Sequence[int] = 0,
         where: Mask | None = None,
         do: Mapping[str, Any] | None = None,
         space: AnyRegion | None = None,
     ) -> Audits:
         """Begin an episode in all selected worlds; see ``Batch.reset``."""
         mask, request = read_mask("where", where, len(self)), request_of(do)
-        seeds, numbers = read_seeds(seed, len(self)), np.zeros(len(self), dtype=np.uint64)
+        seeds = read_seeds(seed, len(self))
+        numbers = np.array(read_numbers(episode, len(self)), dtype=np.uint64)
         for part, members in self._parts if any(one is None for one in seeds) else ():
             now = zip(members.tolist(), part.seeds, np.ravel(part.episode), strict=True)
             for row, old, number in now:
                 if seeds[row] is None and part.has_begun:
                     seeds[row], numbers[row] = old, number + 1
                 elif seeds[row] is None:
-                    seeds[row] = secrets.randbits(63)
+                    seeds[row], numbers[row] = secrets.randbits(63), 0
 
         def begin(asked: Mapping[str, Any]) -> Callable[[Equations, Integers], Audit | None]:
             def act(part: Equations, members: Integers) -> Audit | None:
@@ -422,7 +425,7 @@ class EquationTable:
         found: Mask = (versions == self._versions) & (indices == known)
         return found
 
-    def _by_structure(self, rows: Integers) -> list[tuple[Rows, Integers]]:
+    def by_structure(self, rows: Integers) -> list[tuple[Rows, Integers]]:
         """Return the rows of all worlds, and the numbers of some of them."""
         if not len(rows):
             return []
