@@ -749,7 +749,9 @@ class Simulation(CausalSystem):
             self.structures.task.on(other)
             other.build(self.structure.default_scene())
 
-        require_exact(self.backend, question, takes, independent=independent)
+        require_exact(
+            self.backend, question, takes, independent=self.structure if independent else None
+        )
 
     def require_state(self) -> None:
         """Refuse to continue without an episode, or from a state that the backend has lost."""

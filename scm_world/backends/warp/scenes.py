@@ -37,9 +37,13 @@ from scm_world.models.scene import (
 _NOBODY: tuple[Any, ...] = ((), np.empty((0, 7)), np.empty((0, 7)))
 
 
+def prepared(structure: Model, device: str) -> tuple[SharedModel, Derivation]:
+    """Put a structure on a device, once for each thread: constants are derived in one model."""
+    return _prepared(structure, device, threading.get_ident())
+
+
 @lru_cache(maxsize=32)
 def _prepared(structure: Model, device: str, thread: int) -> tuple[SharedModel, Derivation]:
-    """Put a structure on a device, once for each thread: constants are derived in one model."""
     base = SharedModel(compiled(structure), device)
     return base, Derivation(structure, base.model)
 
@@ -60,7 +64,7 @@ class Group:
 
     def __init__(self, structure: Model, device: str) -> None:
         self.structure = structure
-        self._base, self.derive = _prepared(structure, device, threading.get_ident())
+        self._base, self.derive = prepared(structure, device)
         self._engine: Engine | None = None
         mj = self._base.mj
         data, width = mujoco.MjData(mj), 0
