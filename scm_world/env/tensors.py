@@ -11,7 +11,6 @@ from gymnasium.vector import VectorEnv
 
 from scm_world._arguments import load
 from scm_world._types import Integers, Mask
-from scm_world.backends import Scenes
 from scm_world.env.actions import JOINTS
 from scm_world.env.batch import ScmWorldVectorEnv
 from scm_world.env.observer import FAILED
@@ -84,7 +83,7 @@ class HostEnvs:
 def has_device(envs: Any) -> bool:
     """Return whether the engine of environments has states on a device."""
     batch = getattr(envs, "_batch", None)
-    return batch is not None and type(batch._engine).resident is not Scenes.resident
+    return batch is not None and batch._engine.stays
 
 
 @final
