@@ -19,10 +19,13 @@ pytest.importorskip("mujoco_warp")
 torch = pytest.importorskip("torch")
 pytest.importorskip("rsl_rl")
 
+from mujoco_warp import OverflowType  # noqa: E402
+
+from scm_world.backends.warp.constants import NOTHING  # noqa: E402
 from scm_world.backends.warp.device import Engine  # noqa: E402 # needs the libraries
 from scm_world.env import ScmWorldVectorEnv  # noqa: E402
 from scm_world.env.tensors import TensorEnvs  # noqa: E402
-from scm_world.errors import ModelError  # noqa: E402
+from scm_world.errors import EngineFailure, ModelError  # noqa: E402
 from scm_world.evaluation import evaluate  # noqa: E402
 from scm_world.training.loop import train  # noqa: E402
 from scm_world.training.many import ManyPpo  # noqa: E402
@@ -152,6 +155,34 @@ def test_a_world_that_fails_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> None:
     again = there.step(torch.as_tensor(_actions(3)))
     assert not again.terminated.any()
     assert again.seen.isfinite().all()
+
+
+def test_a_step_in_which_memory_overflows_is_taken_again() -> None:
+    """From the state before it, with the same result."""
+    there, here = _pair("reaching", 0)
+    engine = there._engine._group.synced()
+    plain, calls = engine.launch, list[int]()
+
+    def full_once(substeps: int) -> None:
+        plain(substeps)
+        calls.append(substeps)
+        if len(calls) == 2:
+            there._engine._tensors["overflow"][1] = int(OverflowType.NEFC)
+
+    engine.launch = full_once
+    for step in range(4):
+        _same(there.step(torch.as_tensor(_actions(step))), here.step(_actions(step)))
+    assert len(calls) == 5
+    assert there.copies["steps taken again to the host"] > 0
+
+
+def test_states_do_not_get_lost_where_scenes_are_added() -> None:
+    """Arrays that grow have no states of before: that is an error."""
+    there, _ = _pair("reaching", 0)
+    for _ in range(8):
+        there._engine._group.add(NOTHING)
+    with pytest.raises(EngineFailure, match="scenes were added"):
+        there.step(torch.zeros((N, 9)))
 
 
 @njit
