@@ -343,7 +343,7 @@ def _pictures(found: Consequences) -> dict[str, bytes]:
 def check(
     source: Annotated[str, typer.Argument(metavar="SYSTEM")],
     *,
-    worlds: options.Count = 4,
+    worlds: options.Count = 8,
     ranges: Path | None = None,
     by: Annotated[Literal["set", "reset"] | None, typer.Option(show_default="see sw.check")] = None,
     steps: options.Count = 25,

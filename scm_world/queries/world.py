@@ -61,7 +61,7 @@ class Planned(CausalSystem):
 
     _given = Plan()
     _schedule = _Schedule()
-    is_planned = False
+    is_planned, plan_end = False, 0.0  # of this episode: the last step at which its plan may act
 
     @property
     def plan(self) -> Plan:
@@ -155,7 +155,7 @@ class Planned(CausalSystem):
         for name in acts:
             memory.forget(name, step)
         audit = plan._act(self, step, memory, doing, acts)
-        self._schedule = now._replace(plan=plan, memory=memory)
+        self._follow(now._replace(plan=plan, memory=memory))
         return audit or doing({})
 
     def step(self, action: ArrayLike) -> None:
@@ -182,10 +182,13 @@ class Planned(CausalSystem):
             schedule,
             any(parts for _, parts in schedule.plan.layers()),
         )
+        self.plan_end = max((act.time.last for _, act in schedule.plan.timed()), default=0.0)
 
     def _may_act(self, step: int) -> bool:
         """Return whether the plan of the episode may still intervene at a control step."""
         now = self._schedule
+        if step > self.plan_end:
+            return False
         return step != now.acted and now.plan._concerns(self, step, now.memory)
 
     def act(self) -> Audit | None:

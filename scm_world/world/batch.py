@@ -35,7 +35,7 @@ from scm_world.world.audit import Audit, Audits
 from scm_world.world.compiled_task import CompiledTask, beginnings, check_functions
 from scm_world.world.mechanisms import Rows
 from scm_world.world.philox import CompiledNoise
-from scm_world.world.shared_transaction import SharedTransaction
+from scm_world.world.row_memory import RowMemory, changes
 from scm_world.world.simulation import READ_BACK, Simulation, physics_steps, warn_of_start
 from scm_world.world.snapshot import Snapshot
 
@@ -109,7 +109,7 @@ class Batch:
         self._versions = [-1] * n
         # All others: what they did together, and the place of each in it; the key of the seed, the
         # episode and the control step then; the seeds.
-        self._done: list[SharedTransaction | None] = [None] * n
+        self._done: list[RowMemory | None] = [None] * n
         self._place = np.zeros(n, dtype=int)
         self._where, self._seeds = np.zeros((n, 3), dtype=np.uint64), [0] * n
         self._built = self._exists.copy()  # scenes that the engine has
@@ -373,7 +373,7 @@ class Batch:
             engine.restore(again, [origin.engine])
         numbers = np.repeat(origin.row.numbers[None], len(rows), axis=0)
         numbers[:, natural.fresh] = 0.0
-        one = SharedTransaction(self._structures, origin.structure, natural, numbers, where, own)
+        one = RowMemory(self._structures, origin.structure, natural, numbers, where, own)
         if natural.random:
             self._draw_nature(rows, one, numbers, beginnings(natural, first, where, one.key))
         number = self._number((natural, physics_steps(self._structures.options, origin.structure)))
@@ -392,29 +392,16 @@ class Batch:
         self._gone.difference_update(rows.tolist())
         self._take(one, rows, np.arange(len(rows)), table)
 
-    def _draw_nature(
-        self, rows: Integers, one: SharedTransaction, numbers: Floats, then: Floats
-    ) -> None:
+    def _draw_nature(self, rows: Integers, one: RowMemory, numbers: Floats, then: Floats) -> None:
         """Change worlds that begin to what is drawn in them; see ``Simulation._draw_nature``."""
-        compiled, engine = one.compiled, self._engine
-        layout, size = compiled.composition.system.layout, compiled.state_size
-        moves = (numbers[:, :size] != then[:, :size]) & layout.can_be_set
-        taken = (moves & layout.engine_takes).any(axis=1)
-        names = [name for name in compiled.static_names if name in compiled.parameter_keys]
-        parts = [
-            (numbers[:, at] != then[:, at]).any(axis=1) for at in map(compiled.where.get, names)
-        ]
-        patterns, of = np.unique(np.array([*parts, taken]), axis=1, return_inverse=True)
-        for number, pattern in enumerate(patterns.T):
-            places = np.flatnonzero(of.ravel() == number)
-            changed = [name for name, is_one in zip(names, pattern, strict=False) if is_one]
-            values = Rows(compiled, then[places])
-            parameters = {compiled.parameter_keys[name]: values[name] for name in changed}
-            if parameters or pattern[-1]:
-                states = then[places, :size] if pattern[-1] else None
-                engine.apply(rows[places], parameters, states)
+        compiled, size = one.compiled, one.compiled.state_size
+        for places, changed, moved in changes(compiled, numbers, then)[0]:
+            parameters = _parameters(Rows(compiled, then), changed, places)
+            if parameters or moved:
+                states = then[places, :size] if moved else None
+                self._engine.apply(rows[places], parameters, states)
         numbers[:] = then
-        numbers[:, :size] = engine.read(rows)
+        numbers[:, :size] = self._engine.read(rows)
         numbers[:, compiled.fresh] = 0.0
 
     def _check(self, table: Rows, fresh: Integers) -> None:
@@ -444,8 +431,9 @@ class Batch:
     ) -> Audits:
         """Intervene now in all selected worlds; see ``Simulation.do``.
 
-        Parameters that move no body are set, or drawn from boxes, in all rows at once; other
-        interventions are computed in one world after another. Both give the same bits.
+        An intervention is checked once for worlds that are alike, and computed in their rows; see
+        ``RowMemory.ask`` for those that are computed in one world after another. All give the
+        same bits.
 
         Args:
             request: Values or interventions by name. A value with a leading axis of n worlds, as
@@ -475,7 +463,7 @@ class Batch:
         skips: bool = False,
     ) -> Audits:
         flat = flatten(request)
-        ready: list[tuple[SharedTransaction, Integers, Rows]] = []
+        ready: list[tuple[RowMemory, Integers, Rows]] = []
         alone: list[int] = []
         alike: dict[Any, list[int]] = {}
         now = self.index == self._where[:, 2]
@@ -508,9 +496,9 @@ class Batch:
             raise
         for one, members, table in ready:
             places = np.setdiff1d(np.arange(len(members)), one.refused)
-            which, numbers = members[places], one.numbers[places]
-            table.numbers[which] = numbers
-            moved = which[one.changed[places].any(axis=1)]
+            which, differ = members[places], places[one.differs[places]]
+            moved = members[differ]
+            table.numbers[moved] = one.numbers[differ]
             table.numbers[moved, one.compiled.fresh] = 0.0
             if one.at_start and len(moved):
                 table.remember(moved)
@@ -520,7 +508,7 @@ class Batch:
 
     def _together(
         self, request: Mapping[str, Any], members: Integers, space: AnyRegion | None
-    ) -> tuple[SharedTransaction, Integers, Rows] | None:
+    ) -> tuple[RowMemory, Integers, Rows] | None:
         """Compute an intervention in worlds that are alike; None if each has to do it alone."""
         below: Any = self._done[members[0]]
         compiled = below.compiled
@@ -535,65 +523,70 @@ class Batch:
         where[:, 2] = now[:, compiled.clock]
         seeds = [self._seeds[row] for row in members.tolist()]
         before = below, self._place[members]
-        one = SharedTransaction(
-            self._structures, below.structure, compiled, now, where, seeds, before
-        )
+        one = RowMemory(self._structures, below.structure, compiled, now, where, seeds, before)
         region = self._first.variables_space if space is None else as_region("space", space)
         return (one, members, table) if one.ask(named, values, region) else None
 
-    def _take(self, one: SharedTransaction, rows: Integers, places: Integers, table: Rows) -> None:
+    def _take(self, one: RowMemory, rows: Integers, places: Integers, table: Rows) -> None:
         """Note what worlds have done together; their rows have the values already."""
         for row in rows.tolist():
             self._done[row] = one
         self._place[rows] = places
         self._where[rows] = one.where[places]
         self._changes += 1
-        commands, now = one.compiled.composition.commands, Rows(one.compiled, table.numbers[rows])
-        self._acts_alone[rows] = commands is not None and commands.applies(now)
+        self._acts_alone[rows], commands = False, one.compiled.composition.commands
+        if commands is not None:
+            self._acts_alone[rows] = commands.applies(Rows(one.compiled, table.numbers[rows]))
         if self.names:
             table.evaluate(self.names, rows)
 
     def _write(
-        self, one: SharedTransaction, members: Integers, table: Rows, back: list[Callable[[], None]]
+        self, one: RowMemory, members: Integers, table: Rows, back: list[Callable[[], None]]
     ) -> list[tuple[Integers, Callable[[int], Audit]]]:
         """Change the engine for worlds that intervene together; see ``Simulation._commit``.
 
         Returns:
             Their numbers, and what makes the audit of each; see ``Audits``.
         """
-        compiled, taken = one.compiled, np.ones(len(members), bool)
-        keys, known, taken[one.refused] = compiled.parameter_keys, compiled.inertias, False
-        wanted = {keys[name] for name in one.asked if name in keys}
+        compiled, size = one.compiled, one.compiled.state_size
+        keys, known, targets = compiled.parameter_keys, compiled.inertias, compiled.model.targets
+        wanted = {keys[t] for name in one.asked for t in targets(name) if t in keys}
         old, new = Rows(compiled, table.numbers[members]), Rows(compiled, one.numbers)
+        layout = compiled.composition.system.layout
+        settable, kept = layout.can_be_set, layout.can_be_set & ~layout.engine_takes
         remarked = self._first.backend.capabilities.remarks
         audits: list[tuple[Integers, Callable[[int], Audit]]] = []
-        patterns, of = np.unique(one.changed, axis=0, return_inverse=True)
-        for number, pattern in enumerate(patterns):  # nearly always the same in all of them
-            places = np.flatnonzero(taken & (of.ravel() == number))
-            which = members[places]
-            changed = [n for n, is_one in zip(one.names, pattern, strict=True) if is_one]
-            before, then = (
-                {keys[n]: row[n][places] for n in changed if n in keys} for row in (old, new)
-            )
+        is_moved = False
+        for group, changed, moved in one.groups:
+            places = np.setdiff1d(group, one.refused) if one.refused else group
             if not len(places):
                 continue
+            which = members[places]
+            before, then = (_parameters(each, changed, places) for each in (old, new))
+            left, states = (each.numbers[places, :size] if moved else None for each in (old, new))
             inertia = self._engine.parameters(which, sorted({known[k] for k in then if k in known}))
             others = np.ones(len(which), bool)
             try:
-                if then:
-                    self._engine.apply(which, then)
+                if then or moved:
+                    self._engine.apply(which, then, states)
             except ScmWorldError as error:
                 others = ~np.isin(which, error.scenes)
                 raise located(error, error.scenes[0], "world") from error.__cause__
             finally:  # these have changed
                 values = {key: value[others] for key, value in before.items()}
-                back.append(partial(self._engine.apply, which[others], values))
+                earlier = None if left is None else left[others]
+                back.append(partial(self._engine.apply, which[others], values, earlier))
             reported = self._engine.parameters(which, {*wanted, *then, *inertia})
-            for key, value in then.items():
-                near = np.isclose(reported[key], value, READ_BACK, READ_BACK)
+            found = {".".join(key): (value, reported[key]) for key, value in then.items()}
+            if states is not None:
+                read = np.where(kept, states, self._engine.read(which))
+                found["the state"] = states[:, settable], read[:, settable]
+                one.numbers[places, :size], is_moved = read, True
+            for name, (value, got) in found.items():
+                near = np.isclose(got, value, READ_BACK, READ_BACK)
                 if not near.all():
                     first = which[~near.reshape(len(which), -1).all(axis=1)][0]
-                    said = f"the engine did not take over {'.'.join(key)}"
+                    said = f"the engine did not take over {name}"
                     raise located(EngineFailure(said, self._first.backend.name), first, "world")
             remarks: list[tuple[str, ...]] = []
             for at, row in enumerate(which.tolist()):
@@ -603,6 +596,7 @@ class Batch:
                 was = {key: value[at] for key, value in before.items()}
                 remarks.append(backend.capabilities.remarks(backend, was))
             audits.append((which, partial(one.audit, places, inertia, reported, remarks)))
+        one.states = one.numbers[:, :size].copy() if is_moved else None
         return audits
 
     def _request(self, row: int, flat: Mapping[str, Any]) -> dict[str, Any]:
@@ -903,6 +897,11 @@ def _copied(kind: type[Batch], saved: Mapping[int, Snapshot], *given: Any) -> Ba
     for row, snapshot in saved.items():
         made._alone(row).restore(snapshot)
     return made
+
+
+def _parameters(rows: Rows, names: Iterable[str], places: Integers) -> dict[Any, Value]:
+    keys = rows.compiled.parameter_keys
+    return {keys[name]: rows[name][places] for name in names if name in keys}
 
 
 # --- arguments of many worlds ---------------------------------------------------------------------
