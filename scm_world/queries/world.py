@@ -458,6 +458,8 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         begins: Any = None,
         held_out: float | None = None,
         setups: Sequence[Mapping[str, object]] | None = None,
+        columns: Mapping[str, str] | None = None,
+        ignore: Iterable[str] = (),
         symmetric: bool = False,
         progress: Progress | None = None,
         search: Search | None = None,
@@ -495,6 +497,8 @@ class World(Planned, _System, Questions, metaclass=_Opener):
             setups: The set-up of each of several recordings: values of parameters that were set for
                 it, ``[{}, {"weight.mass": 1.0}]``. A recording may carry its own: a column
                 ``do.weight.mass``, or arrays by name with ``"do": {"weight.mass": 1.0}``.
+            columns: Names of this world by those of the tables, ``{"torque": "motor.control"}``.
+            ignore: Patterns of columns that are left out.
             symmetric: Whether ranges [-a, a], such as those of forces, stay symmetric.
             progress: Called after each round of estimating the noise.
             search: What finds the next minimum of least squares; ``gauss_newton`` if None. See
@@ -519,7 +523,7 @@ class World(Planned, _System, Questions, metaclass=_Opener):
 
         options: Any = {"noise": noise, "window": window, "begins": begins}
         options |= {"held_out": held_out, "setups": setups, "progress": progress}
-        options |= {"symmetric": symmetric}
+        options |= {"symmetric": symmetric, "columns": columns, "ignore": ignore}
         options |= {} if search is None else {"search": search}
         return fit(self, recording, parameters, **options)
 
@@ -534,6 +538,8 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         window: int | None = None,
         begins: Any = None,
         setups: Sequence[Mapping[str, object]] | None = None,
+        columns: Mapping[str, str] | None = None,
+        ignore: Iterable[str] = (),
         progress: Progress | None = None,
     ) -> Deviation:
         """Find which parameter accounts for the deviation of a recording from this world.
@@ -554,6 +560,8 @@ class World(Planned, _System, Questions, metaclass=_Opener):
             window: Number of rows of a window; 50 if None.
             begins: See ``fit``.
             setups: See ``fit``.
+            columns: See ``fit``.
+            ignore: See ``fit``.
             progress: Called after each fit.
 
         Raises:
@@ -562,7 +570,8 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         from scm_world.fit import explain
 
         options: Any = {"noise": noise, "window": window, "begins": begins, "setups": setups}
-        return explain(self, recording, candidates, most=most, progress=progress, **options)
+        options |= {"columns": columns, "ignore": ignore, "most": most}
+        return explain(self, recording, candidates, progress=progress, **options)
 
     def for_fit(self, recording: object) -> World:
         """Return the world that a fit computes: of equations, that of their step function."""
