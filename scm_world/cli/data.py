@@ -369,9 +369,8 @@ def collect(
                 for kind, count in Counter(kinds.tolist()).items():
                     for name in part.regimes[kind].targets or ("",):
                         done[f"do({name})" if name else "no intervention"] += count
-    shown = done.most_common()
     console.frame(
-        {"": [name for name, _ in shown], "episodes": [count for _, count in shown]},
+        [{"": name, "episodes": count} for name, count in done.most_common()],
         title=f"Collected from {tag(task)} on {engine}, seed {asked.seed}: {size['episodes']} "
         f"episodes, {size['rows']} rows, {len(part.columns)} columns",
     )
