@@ -487,6 +487,18 @@ def counterfactual(
 # --- recordings -----------------------------------------------------------------------------------
 
 
+def _setups(given: list[str], n: int) -> list[dict[str, object]]:
+    """Return the set-up of each of n recordings from texts ``number:name=value``."""
+    found: list[dict[str, object]] = [{} for _ in range(n)]
+    for text in given:
+        number, colon, rest = text.partition(":")
+        if not colon or not number.isdigit() or int(number) >= n:
+            allowed = (f"0:name=value to {n - 1}:name=value, with the number of a recording",)
+            raise UnknownOption("--setup", text, allowed)
+        found[int(number)] |= parse_assignments([rest], "'--setup'")
+    return found
+
+
 def fit(
     task: options.System,
     recordings: Annotated[list[str], typer.Argument(metavar="RECORDING...")],
@@ -495,6 +507,10 @@ def fit(
     noise: options.Pairs = None,
     window: options.NotNegative = 0,
     begins: Annotated[list[str] | None, typer.Option(metavar="rest|NAME=VALUE,SD")] = None,
+    setup: Annotated[list[str] | None, typer.Option(metavar="NUMBER:NAME=VALUE")] = None,
+    symmetric: bool = False,
+    held_out: options.Amount = 0.0,
+    predict: options.Words = None,
     suggest: options.NotNegative = 0,
     steps: Annotated[int | None, typer.Option(min=2, show_default="the longest run's")] = None,
     limits: Annotated[list[str] | None, typer.Option(metavar="NAME=LOW,HIGH")] = None,
@@ -518,6 +534,11 @@ def fit(
             explain the recording.
         begins: How the recordings begin: 'rest', or a state with its standard deviation, such as
             '*.velocity=0,0.01'; fitted by default.
+        setup: Value of a parameter that was set for a recording, such as 1:weight.mass=1.0; the
+            first recording has the number 0.
+        symmetric: Whether fitted ranges [-a, a] stay symmetric.
+        held_out: Share of the rows at the end of each run that are predicted, not fitted.
+        predict: Another recording, which is predicted by the fit and by the unfitted world.
         suggest: Number of further experiments that are suggested; their commands are written.
         steps: Control steps of a suggested experiment.
         limits: Range that suggested experiments keep, such as '*.velocity=-2,2', besides those of
@@ -534,14 +555,17 @@ def fit(
     with asked.open(name, task) as (system, folder, engine), console.progress("fits") as tell:
         began = "rest" if begins == ["rest"] else parse_assignments(begins, "'--begins'") or None
         given: dict[str, Any] = {"noise": known, "window": size, "begins": began, "progress": tell}
+        given["setups"] = _setups(setup, len(recordings)) if setup else None
         shown: sw.Fit | sw.Deviation
         if parameters:
+            given |= {"held_out": held_out or None, "symmetric": symmetric}
             found = shown = system.fit(recordings, parameters, **given)
             combinations = found.identifiable.drop(columns="parameters")
             frames = {"fit": found.table, "identifiable": combinations}
         else:
             shown = deviation = system.explain(recordings, **given)
             found, frames = deviation.fit, {"explanation": deviation.table}
+        predictions = {other: found.predict(other) for other in predict or ()}
         other = found.counterfactual(request, at=at, run=run, seed=asked.seed) if request else None
         try:
             if suggest:
@@ -552,6 +576,9 @@ def fit(
     console.say(shown, *(() if parameters else found.remarks))
     if parameters:
         console.frame(combinations, title="identifiable")
+    console.say(*(f"{path}: {prediction}" for path, prediction in predictions.items()))
+    if found.held_out is not None:
+        predictions["held out"] = found.held_out
     if other is not None:
         last = other.groupby("column", sort=False).tail(1)
         console.frame(last, title=f"end of run {run}, with {', '.join(do or ())} from {at} on")
@@ -568,6 +595,8 @@ def fit(
         misfit=found.misfit,
         explains=found.explains,
         remarks=found.remarks,
+        replay=found.replay.to_dict("records"),
+        predictions={name: one.table.to_dict("records") for name, one in predictions.items()},
         starts=[experiment.start for experiment in experiments],
     )
     files = {f"{name}.csv": table.to_csv(index=False) for name, table in tables.items()}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias, final
 
 import numpy as np
@@ -14,6 +14,7 @@ from scm_world._types import Floats
 from scm_world.errors import EngineFailure, InterventionError, UnknownOption
 from scm_world.fit.problem import FitProblem, LeastSquares, projected, spread_of, windows_of
 from scm_world.fit.recordings import (
+    DO,
     TIME,
     Limits,
     Measurements,
@@ -22,6 +23,7 @@ from scm_world.fit.recordings import (
     commands_of,
     labels,
     limits_of,
+    setup_of,
 )
 from scm_world.fit.shooting import Shooting
 from scm_world.fit.targets import twin_of, values_of
@@ -65,6 +67,7 @@ class Experiment:
         after: The same with this experiment, and with those suggested before it.
         errors: Standard errors of the scaled parameters before and after it, by name.
         unseen: Parameters that no experiment seems to determine.
+        do: Its set-up: values of parameters that are set for it, by columns.
     """
 
     commands: Floats
@@ -75,13 +78,15 @@ class Experiment:
     after: float
     errors: Mapping[str, tuple[float, float]]
     unseen: tuple[str, ...] = ()
+    do: Mapping[str, float] = field(default_factory=dict)
 
     def frame(self) -> pd.DataFrame:
-        """Return a row for each control step: the time [s] and the commands."""
+        """Return a row for each control step: the time [s], the commands and the set-up."""
         import pandas as pd
 
         time = self.control_dt * np.arange(len(self.commands))
-        return pd.DataFrame({TIME: time, **dict(zip(self.names, self.commands.T, strict=True))})
+        frame = pd.DataFrame({TIME: time, **dict(zip(self.names, self.commands.T, strict=True))})
+        return frame.assign(**{f"{DO}{name}": value for name, value in self.do.items()})
 
     def __str__(self) -> str:
         start = ", ".join(
@@ -94,8 +99,11 @@ class Experiment:
         )
         nothing = f"; no experiment seems to determine {', '.join(self.unseen)}" * bool(self.unseen)
         steps = len(self.commands)
+        setup = ", ".join(f"{name} = {value:g}" for name, value in self.do.items())
         return (
-            f"{steps} control steps ({steps * self.control_dt:.3g} s) from "
+            f"with {setup}: "
+            * bool(setup)
+            + f"{steps} control steps ({steps * self.control_dt:.3g} s) from "
             f"{start or 'the default start'}: standard errors {errors}; smallest singular value "
             f"{self.before:.3g} → {self.after:.3g}{nothing}"
         )
@@ -108,10 +116,18 @@ class Candidate(NamedTuple):
     start: dict[str, Start]
     vector: Floats
     impacts: int
+    do: Mapping[str, float]
 
 
 def suggested(
-    fit: Fit, known: Floats, n: int, *, steps: int, limits: Limits | None, seed: int
+    fit: Fit,
+    known: Floats,
+    n: int,
+    *,
+    steps: int,
+    limits: Limits | None,
+    seed: int,
+    setups: Sequence[Mapping[str, object]],
 ) -> tuple[Experiment, ...]:
     """Choose experiments after which the parameters have the least variance; see ``Fit.suggest``.
 
@@ -124,16 +140,22 @@ def suggested(
     n, steps = whole_number("n", n, least=1), whole_number("steps", steps, least=2)
     seed = whole_number("seed", seed, least=0)
     do = {**fit.asked.plan.at_start(), **values_of(fit.targets, fit.scaled)}
+    every: list[Mapping[str, object]] = [{}, *setups]
     chosen = list[Experiment]()
     with twin_of(fit.asked) as twin:
         allowed, names = limits_of(twin, limits), tuple(commands_of(twin))
         for number in range(n):
-            rng = np.random.default_rng((seed, number))
-            made = [_candidate(twin, do, rng, steps, allowed, i) for i in range(CANDIDATES)]
+            for setup in setups:
+                twin.reset(seed=0)
+                twin.do({**do, **setup})  # refused here, and not in each experiment
+            made = list[Candidate | str]()
+            for setup in every:
+                rng, how = np.random.default_rng((seed, number)), (steps, allowed, setup)
+                made += [_candidate(twin, do, rng, *how, i) for i in range(CANDIDATES)]
             tried = [one for one in made if isinstance(one, Candidate)]
             if not tried:
                 worst = Counter(map(str, made)).most_common(1)[0][0]
-                problem = f"{CANDIDATES} sequences of {steps} control steps, which all leave the "
+                problem = f"{len(made)} sequences of {steps} control steps, which all leave the "
                 problem += f"limits, most of them those of {worst}"
                 raise UnknownOption("limits", problem, ("wider limits", "fewer steps"))
             best, along = _best(fit, known, tried)
@@ -141,7 +163,8 @@ def suggested(
             errors = (np.sqrt(np.diag(spread_of(one))) for one in (known, both))
             named = zip((t.name for t in fit.targets), zip(*errors, strict=True), strict=True)
             about = names, twin.options.control_period, _smallest(known), _smallest(both)
-            chosen.append(Experiment(best.commands, best.start, *about, dict(named), fit.unseen))
+            rest = dict(named), fit.unseen, best.do
+            chosen.append(Experiment(best.commands, best.start, *about, *rest))
             known = both
     return tuple(chosen)
 
@@ -152,6 +175,7 @@ def _candidate(
     rng: np.random.Generator,
     steps: int,
     limits: Limits,
+    setup: Mapping[str, object],
     number: int,
 ) -> Candidate | str:
     """Return an experiment that keeps the limits, or the name of a column that leaves them.
@@ -163,7 +187,7 @@ def _candidate(
     ends = np.array([limits[name] for name in commands_of(twin)]).reshape(-1, 2)
     low, high = ends.mean(axis=1) + 0.5 * WITHIN * np.diff(ends, axis=1).T * [[-1.0], [1.0]]
     signal = _signal(rng, steps, n_actions, number)
-    start, left = dict[str, Start](), ""
+    start, left, do = dict[str, Start](), "", {**do, **setup}
     try:
         twin.reset(seed=0)
         twin.do(do)
@@ -188,7 +212,7 @@ def _candidate(
             commands, vector = middle + share * np.abs(signal) * reach, twin.vector.copy()
             left, impacts = _followed(twin, commands, limits)
             if not left:
-                return Candidate(commands, start, vector, impacts)
+                return Candidate(commands, start, vector, impacts, setup_of(twin, setup))
     except InterventionError:
         return "the start"
     except EngineFailure:
@@ -267,7 +291,7 @@ def _planned(fit: Fit, tried: Sequence[Candidate]) -> Measurements:
     steps, size = len(tried[0].commands) + 1, len(fit.columns)
     values = np.zeros((steps, size))
     values[1:, len(fit.measured.recorded) :] = np.nan
-    runs = [RecordedRun(one.commands, np.arange(steps), values) for one in tried]
+    runs = [RecordedRun(one.commands, np.arange(steps), values, do=one.do) for one in tried]
     return replace(fit.measured, runs=tuple(runs))
 
 
@@ -276,7 +300,7 @@ def unseen(fit: Fit, names: Sequence[str]) -> tuple[str, ...]:
     rng, do = np.random.default_rng(0), fit.asked.plan.at_start()
     with twin_of(fit.asked) as twin:
         limits = limits_of(twin, None)
-        made = [_candidate(twin, do, rng, SETTLING, limits, i) for i in range(PROBES)]
+        made = [_candidate(twin, do, rng, SETTLING, limits, {}, i) for i in range(PROBES)]
     tried = [one for one in made if isinstance(one, Candidate)]
     if not tried:
         return ()

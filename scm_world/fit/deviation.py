@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, final
 
@@ -173,12 +173,13 @@ def explain(
     noise: Noise = None,
     window: int | None = None,
     begins: Begins = None,
+    setups: Sequence[Mapping[str, object]] | None = None,
     progress: Progress | None = None,
     search: Search = gauss_newton,
 ) -> Deviation:
     """Fit candidates to a recording, and compare them; see ``World.explain`` and ``Search``."""
     most, world = whole_number("most", most, least=1), world.for_fit(recording)
-    measured, targets = arguments_of(world, recording, candidates, window, begins)
+    measured, targets = arguments_of(world, recording, candidates, window, begins, setups)
     given = measured.given(noise)
     with Shooting(world, measured, targets) as shooting:
         problem = FitProblem(shooting, measured, targets, given, window)
@@ -234,6 +235,9 @@ class _Comparison:
                 self._consider(best, self._slopes(best), fewer)
             if self._found().chosen == best:
                 self._search_thoroughly(best)
+        best = self._found().chosen
+        played = self._search.played(self._minima[best].at.scaled)
+        self._fits[best] = replace(self._fits[best], played=played)
         return self._found()
 
     def _found(self) -> Deviation:

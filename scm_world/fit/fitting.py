@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from scm_world._arguments import typed, whole_number
 from scm_world._patterns import as_names
 from scm_world._types import Floats
 from scm_world.errors import ModelError, UnknownOption
+from scm_world.fit.prediction import parted
 from scm_world.fit.problem import (
     PRIOR,
     SHORT,
@@ -53,12 +54,17 @@ def fit(
     noise: Noise = None,
     window: int | None = None,
     begins: Begins = None,
+    held_out: float | None = None,
+    setups: Sequence[Mapping[str, object]] | None = None,
+    symmetric: bool = False,
     progress: Progress | None = None,
     search: Search = gauss_newton,
 ) -> Fit:
     """Fit parameters to a recording with any search; see ``World.fit`` and ``Search``."""
     world = world.for_fit(recording)
-    measured, targets = arguments_of(world, recording, as_names(parameters), window, begins)
+    how = window, begins, setups, symmetric
+    measured, targets = arguments_of(world, recording, as_names(parameters), *how)
+    measured, later = (measured, None) if held_out is None else parted(measured, held_out)
     count, number = len(measured.cells[0]), len(targets)
     known = measured.given(noise)
     usual = (WINDOW, SHORT, WINDOW) if window is None else (window,)
@@ -77,7 +83,7 @@ def fit(
                 found = fitted(minima, range(number), first, progress)
                 if attempt != 2 or max(found.misfit.values()) < CLEAR:
                     break
-    return dataclasses.replace(found, shortened=attempt == 2)
+    return dataclasses.replace(found, shortened=attempt == 2, later=later)
 
 
 def arguments_of(
@@ -86,6 +92,8 @@ def arguments_of(
     parameters: Iterable[str] | None,
     window: int | None,
     begins: Begins = None,
+    setups: Sequence[Mapping[str, object]] | None = None,
+    symmetric: bool = False,
 ) -> tuple[Measurements, tuple[Target, ...]]:
     """Check and read the arguments of a fit; all parameters that act on a measurement if None."""
     if window is not None:
@@ -97,9 +105,9 @@ def arguments_of(
         problem = f"the world is given {late} at a time, and a recording may begin at any"
         raise ModelError([f"{problem}: give values without a time"])
     with twin_of(world) as twin:
-        measured = read_recording(twin, recording)
+        measured = read_recording(twin, recording, setups)
         asked = acting(twin, measured.columns) if parameters is None else parameters
-        targets = targets_of(twin, asked)
+        targets = targets_of(twin, asked, symmetric=symmetric)
         check_units(world, measured)
         measured = begun(twin, measured, begins)
     if any(target.values is not None and not target.values.any() for target in targets):
@@ -139,7 +147,7 @@ def fitted(
         reach = np.maximum(reach, np.array([-away, away]).T + margin)
     if progress is not None:
         progress(SEARCHES, SEARCHES)
-    return dataclasses.replace(found, reach=reach)
+    return dataclasses.replace(found, reach=reach, played=minima.played(best.at.scaled))
 
 
 def described(minima: Minima, active: Sequence[int], best: Result) -> Fit:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -26,13 +26,13 @@ from scm_world.errors import (
 from scm_world.geometry.rotations import aligned
 from scm_world.queries.episodes import Episode
 from scm_world.runs.files import located, read_arrays, read_bytes
-from scm_world.variables import Box, Rotations
+from scm_world.variables import Box, Rotations, Variable
 from scm_world.world import Simulation
 
 if TYPE_CHECKING:
     import pandas as pd
 
-TIME, EPISODE = "time", "episode"
+TIME, EPISODE, SETUP, DO = "time", "episode", "do", "do."
 JITTER = 0.25  # of a control step: largest error of a time
 DRIFT = 0.002  # largest relative error of a clock
 GAP = 1.5  # of the usual distance of rows: a longer one ends a run
@@ -99,6 +99,7 @@ class RecordedRun:
         values: Measurements, shape (rows, columns); NaN where nothing was measured.
         begin: Time of its first row [s].
         whole: Whether it begins with the recording, and not after a gap.
+        do: Its set-up: values of parameters that were set for it, by columns.
     """
 
     commands: Floats
@@ -106,6 +107,7 @@ class RecordedRun:
     values: Floats
     begin: float = 0.0
     whole: bool = True
+    do: Mapping[str, float] = field(default_factory=dict)
 
     @cached_property
     def filled(self) -> Floats:
@@ -116,6 +118,14 @@ class RecordedRun:
             if seen.any():
                 column[:] = np.interp(self.instants, self.instants[seen], column[seen])
         return found
+
+    def part(self, first: int, last: int, control_dt: float) -> RecordedRun:
+        """Return the run from a row to that before another one, with the length of a step [s]."""
+        since, instants = int(self.instants[first]), self.instants[first:last]
+        sent = self.commands[since : int(instants[-1])]
+        begin, whole = self.begin + control_dt * since, self.whole and not first
+        rest = self.values[first:last], begin, whole, self.do
+        return RecordedRun(sent, instants - since, *rest)
 
 
 @final
@@ -207,7 +217,40 @@ def labels(name: str, shape: tuple[int, ...]) -> list[str]:
     return [name] if shape == () else [f"{name}[{i}]" for i in range(int(np.prod(shape)))]
 
 
-def read_recording(world: Simulation, recording: Recording) -> Measurements:
+def setup_of(world: Simulation, do: Any) -> dict[str, float]:
+    """Return the set-up of a run, values of parameters by name, by its columns.
+
+    Raises:
+        UnknownOption: It is no dictionary, or a value has another shape.
+        UnknownVariable: A name is not that of a parameter that can be set.
+    """
+    if not isinstance(do, Mapping):
+        raise UnknownOption("set-up", do, ("a dictionary of values of parameters by name",))
+    known, found = settable_of(world), dict[str, float]()
+    parts = {label: name for name in known for label in labels(name, known[name].shape)}
+    for name, value in do.items():
+        if name not in known and name not in parts:
+            raise UnknownVariable(str(name), [*known, *parts])
+        own = labels(name, known[name].shape) if name in known else [name]
+        try:
+            numbers = np.asarray(value, float).ravel()
+        except (TypeError, ValueError):
+            numbers = np.array([np.nan])
+        if len(numbers) != len(own) or not np.isfinite(numbers).all():
+            raise UnknownOption(f"set-up of {name!r}", value, (f"{len(own)} finite numbers",))
+        found |= dict(zip(own, numbers.tolist(), strict=True))
+    return found
+
+
+def settable_of(world: Simulation) -> dict[str, Variable]:
+    """Return the parameters of real numbers that can be set, by name."""
+    variables = {name: world.model.declared(name) for name in world.compiled.static_names}
+    return {n: v for n, v in variables.items() if v.is_root and v.settable and v.dtype == "real"}
+
+
+def read_recording(
+    world: Simulation, recording: Recording, setups: Sequence[Mapping[str, object]] | None = None
+) -> Measurements:
     """Read a recording.
 
     A run ends where a command is not known: at a gap, which is longer than the usual (median)
@@ -217,13 +260,21 @@ def read_recording(world: Simulation, recording: Recording) -> Measurements:
         world: The model of the recorded system, which defines the control step and the meaning of
             the columns.
         recording: See ``World.fit``.
+        setups: The set-up of each of several recordings, if they do not have it.
 
     Raises:
-        UnknownOption: The recording is of another kind.
+        UnknownOption: The recording is of another kind, or has another number of set-ups.
         ModelError: The tables have faults; see ``World.fit``.
         UnreadableFile: A file cannot be read.
     """
-    frames, known = [*_frames(world, recording)], columns_of(world)
+    known = columns_of(world)
+    frames: list[tuple[str, pd.DataFrame, bool]] = []
+    every = [*recording] if isinstance(recording, list | tuple) else [recording]
+    if setups is not None and len(setups) != len(every):
+        raise UnknownOption("setups", f"{len(setups)} set-ups", (f"{len(every)}, one of each",))
+    for number, one in enumerate(every, 1):
+        label = f"run {number}" if one is not recording else ""
+        frames += _frames(world, one, label, {} if setups is None else setups[number - 1])
     if not frames:
         raise UnknownOption("recording", recording, ("one or more runs",))
     for label, frame, _ in frames:
@@ -312,10 +363,18 @@ def _refuse(problems: Iterable[str], label: str = "") -> None:
 
 
 def _frames(
-    world: Simulation, given: Any, label: str = ""
+    world: Simulation, given: Any, label: str = "", do: object = None
 ) -> Iterator[tuple[str, pd.DataFrame, bool]]:
-    """Yield each table or episode: a name, a frame with the time [s], and if we recorded it."""
+    """Yield each table or episode: a name, a frame with the time [s], and if we recorded it.
+
+    Its set-up becomes columns.
+    """
     import pandas as pd
+
+    if do:
+        setup = {f"{DO}{name}": value for name, value in setup_of(world, do).items()}
+        yield from ((n, frame.assign(**setup), by) for n, frame, by in _frames(world, given, label))
+        return
 
     dt = world.options.control_period
     if isinstance(given, list | tuple):
@@ -335,7 +394,8 @@ def _frames(
         else:
             yield label, frame, False
     elif isinstance(given, Mapping):
-        yield from _frames(world, _framed(given), label)
+        arrays = {name: given[name] for name in given if name != SETUP}
+        yield from _frames(world, _framed(arrays), label, given.get(SETUP))
     elif hasattr(given, "iterate_episodes"):  # a dataset of Minari
         _refuse_scaled(given)
         for one in given.iterate_episodes():
@@ -469,11 +529,20 @@ def _faults(world: Simulation, frame: pd.DataFrame) -> Iterator[str]:
         return
     if len(frame) < 2:
         yield f"a run has two rows or more, got {len(frame)}"
+    setup = [name for name in names if name.startswith(DO)]
     parameters = [name for name in names if name.partition("[")[0] in world.compiled.static]
     if parameters:
         said = f"the columns {', '.join(parameters)} are parameters, which are not measured"
-        yield f"{said}: leave them out, or fix them with world.given({{…}})"
-    there = {TIME, *commands, *known}
+        said += f": name them {', '.join(f'{DO}{name}' for name in parameters)}, if they were set"
+        yield f"{said} for this run, leave them out, or fix them with world.given({{…}})"
+    if setup:
+        settable = settable_of(world)
+        parts = [f"{DO}{label}" for n, v in settable.items() for label in labels(n, v.shape)]
+        yield from (f"{UnknownVariable(n, parts)}" for n in setup if n not in parts)
+        several = (name for name in setup if frame[name].nunique() > 1)
+        advice = "one run has one set-up: tell runs apart by a column 'episode'"
+        yield from (f"the column {name!r} has several values: {advice}" for name in several)
+    there = {TIME, *commands, *known, *setup}
     unknown = [name.partition("[")[0] for name in names if name not in {*parameters, *there}]
     for name in dict.fromkeys(unknown):
         yield f"rename a column, or leave it out: {UnknownVariable(name, sorted(there))}"
@@ -546,7 +615,9 @@ def _runs(
         if np.isfinite(values[rows]).any():
             commands = np.repeat(np.clip(sent[rows[:-1]], low, high), repeats, axis=0)
             begin, whole = float(time[rows[0]]), not rows[0]
-            yield RecordedRun(commands, instants, values[rows], begin, whole)
+            setup = [str(n) for n in numbers if str(n).startswith(DO) and numbers[n].notna().any()]
+            do = {name.removeprefix(DO): float(numbers[name].max()) for name in setup}
+            yield RecordedRun(commands, instants, values[rows], begin, whole, do)
 
 
 def _not_rising(time: Floats, dt: float) -> Iterator[str]:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, final
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from scm_world._arguments import typed, whole_number
 from scm_world._types import Floats, Integers
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.fit.design import PROBES, Experiment, suggested, unseen
+from scm_world.fit.prediction import Prediction, predicted
 from scm_world.fit.problem import (
     SHORT,
     WINDOW,
@@ -32,9 +33,18 @@ from scm_world.fit.recordings import (
     RecordedRun,
     at_rest,
     columns_of,
+    read_recording,
 )
 from scm_world.fit.shooting import Shooting
-from scm_world.fit.targets import FAR, Target, delays_of, free_states, ranges_of, values_of
+from scm_world.fit.targets import (
+    FAR,
+    Target,
+    delays_of,
+    free_states,
+    ranges_of,
+    twin_of,
+    values_of,
+)
 from scm_world.geometry.rotations import aligned
 from scm_world.queries.world import World
 from scm_world.runs.canvas import PALETTE, blank, styled
@@ -50,6 +60,7 @@ CONFIDENCE = 0.95
 DETERMINED = 0.25  # largest standard error of a determined combination: a share of the value
 MISFIT = 1.5  # least residual that the noise does not explain, in standard deviations of it
 AWAY = 0.5  # of the spread of a state in the recording, at which it is far from rest
+WORSE = 1.1  # times the error of the unfitted world, with which a fit replays worse than it
 MAIN = 0.3  # least share of a parameter in a combination that is named
 DRAWN = 8  # columns of a picture
 
@@ -73,6 +84,8 @@ class Fit:
         reach: How far the intervals reach down and up, scaled, shape (p, 2); None if linearised.
         shortened: Whether the windows are shorter than usual because segments did not join.
         ended: Whether the search took all its steps before it found a minimum.
+        played: See ``replay``, of the fit and the unfitted world, (2, columns).
+        later: The rows that were held out.
 
     Example:
         >>> from scm_world.queries import World
@@ -100,6 +113,8 @@ class Fit:
     reach: Floats | None = None
     shortened: bool = False
     ended: bool = False
+    played: Floats | None = None
+    later: Measurements | None = None
 
     @property
     def runs(self) -> tuple[RecordedRun, ...]:
@@ -277,7 +292,7 @@ class Fit:
                 low, high = sorted((float(low), float(high)))
                 width, most = (high - low) / target.scale, max(abs(value) / target.scale, 1.0)
             at_most = open_ends[0][0] and high <= target.default
-            determined = bool((width <= most or at_most) and not self.ended)
+            determined = bool((width <= most or at_most) and not (self.ended or self.worse))
             if open_ends[0][0] and open_ends[1][1]:
                 low, high, determined = np.nan, np.nan, False
             deviation = value / target.default - 1.0 if target.default else np.nan
@@ -370,9 +385,68 @@ class Fit:
         ratio = float(moved @ moved) / self.discount / rank
         return ratio > float(fdtri(rank, self.degrees, CONFIDENCE))
 
+    @cached_property
+    def replay(self) -> pd.DataFrame:
+        """Runs that are played from their first row, without measurements on the way.
+
+        A row for each measured column, with its ``unit`` and the root mean square of measured
+        minus played, by the ``fit``, by the ``unfitted`` world from the same start, and by a
+        ``constant``, the mean of the column.
+        """
+        import pandas as pd
+
+        columns = self.measured.recorded
+        n = len(columns)
+        mean = np.nanstd(self.measured.values, axis=0)[:n]
+        fit, unfitted = np.full((2, n), np.nan) if self.played is None else self.played[:, :n]
+        about = {"column": [c.name for c in columns], "unit": [c.unit for c in columns]}
+        return pd.DataFrame({**about, "fit": fit, "unfitted": unfitted, "constant": mean})
+
+    @property
+    def _replayed(self) -> tuple[float, float]:
+        """The errors of the replay of the fit and the unfitted world, in those of a constant."""
+        size = np.maximum(self.replay.constant, self.measured.least[: len(self.replay)])
+        one, other = (((self.replay[kind] / size) ** 2).mean() for kind in ("fit", "unfitted"))
+        return float(one) ** 0.5, float(other) ** 0.5
+
+    @property
+    def worse(self) -> bool:
+        """Whether the unfitted world replays the recording better than the fit and a constant."""
+        fit, unfitted = self._replayed
+        return unfitted < min(1.0, fit / WORSE)
+
+    @typed
+    def predict(self, recording: object, *, ahead: float | None = None) -> Prediction:
+        """Predict another recording, beside the world that was asked and a constant.
+
+        It is cut into windows that do not overlap. The fitted and the unfitted world each begin
+        where the first ten rows of a window show, and predict the others.
+
+        Args:
+            recording: The recording, of the kinds of ``World.fit``.
+            ahead: How far to predict [s]; 40 rows if None, or as a window of the fit.
+
+        Raises:
+            UnknownOption: No window has a row to predict.
+            ModelError: The recording has faults.
+        """
+        with twin_of(self.asked) as twin:
+            return predicted(self, read_recording(twin, recording), ahead)
+
+    @cached_property
+    def held_out(self) -> Prediction | None:
+        """The prediction of the rows that were held out, if there are such rows."""
+        return None if self.later is None else predicted(self, self.later, None)
+
     def __str__(self) -> str:
         table = self.table.to_string(index=False, float_format="{:.4g}".format, na_rep="none")
-        return "\n".join([table, *self.remarks])
+        parts = [table, *self.remarks]
+        if self.played is not None:
+            replay = self.replay.to_string(index=False, float_format="{:.4g}".format)
+            parts.append(f"played from the first row, root mean square of the error:\n{replay}")
+        if self.held_out is not None:
+            parts.append(f"held out: {self.held_out}")
+        return "\n".join(parts)
 
     __repr__ = __str__
 
@@ -400,7 +474,18 @@ class Fit:
             f"no experiment of this model seems to determine {name}: it changes {tried}"
             for name in self.unseen
         ]
-        groups = (tuple(n for n in names if n not in self.unseen) for names in self.confounded)
+        groups = [tuple(n for n in names if n not in self.unseen) for names in self.confounded]
+        if self.worse:
+            found.append(
+                "played from the first row, the unfitted world is nearer to the recording than the "
+                "fit: none of these values is determined"
+            )
+            groups = []
+        elif self._replayed[0] > WORSE:
+            found.append(
+                "played from the first row, a constant is nearer to the recording than the fit, "
+                "which does not predict that far ahead"
+            )
         for names in filter(None, groups):
             alone = len(names) == 1
             said = "is not determined" if alone else "cannot be told apart"
@@ -408,7 +493,7 @@ class Fit:
                 f"{', '.join(names)} {said} by this recording; suggest(1), or --suggest 1 of the "
                 f"command, has an experiment that does it"
             )
-        if self.asked.substeps == 1:
+        if self.asked is not None and self.asked.substeps == 1:
             found += [
                 f"{target.name}: a control step has one physics step, in which a delay that ends "
                 "there is the mean of two commands"
@@ -470,6 +555,7 @@ class Fit:
         steps: int | None = None,
         limits: Limits | None = None,
         seed: int = 0,
+        setups: Sequence[Mapping[str, object]] = (),
     ) -> tuple[Experiment, ...]:
         """Suggest experiments that determine the least determined parameters.
 
@@ -483,15 +569,19 @@ class Fit:
             limits: Ranges of commands, states or readouts by patterns of columns, such as
                 ``{"elbow.velocity": (-2, 2)}``. The ranges of commands and joints always hold.
             seed: Seed of the sequences.
+            setups: Set-ups that the machine may have, besides its own: values of parameters,
+                ``[{"weight.mass": 1.0}]``. An experiment in one of them says so (``do``).
 
         Raises:
             UnknownOption: Limits exceed the range of a command, or every sequence leaves them.
+            InterventionError: A set-up is refused.
             UnknownVariable: A pattern of limits fits no column.
         """
         longest = max(len(run.commands) for run in self.runs)
         count = longest if steps is None else steps
         known = self.sensitivities / np.sqrt(self.discount)
-        return suggested(self, known, n, steps=count, limits=limits, seed=seed)
+        how: Any = {"steps": count, "limits": limits, "seed": seed, "setups": setups}
+        return suggested(self, known, n, **how)
 
     def counterfactual(
         self, do: Mapping[str, object], *, at: int = 0, run: int = 0, draws: int = 32, seed: int = 0

@@ -17,8 +17,10 @@ from scm_world.fit.problem import (
     Minimum,
     Search,
     Window,
+    by_column,
     degrees,
     projected,
+    windows_of,
 )
 from scm_world.queries.progress import Progress
 
@@ -187,6 +189,7 @@ class Minima:
     def __init__(self, problem: FitProblem, search: Search = gauss_newton) -> None:
         self.problem, self.search = problem, search
         self._guess = [*problem.simulator.guess(problem.segments)]
+        self._unfitted: Floats | None = None
 
     def found(
         self,
@@ -216,6 +219,27 @@ class Minima:
             scaled[[*active]] = values
             scaled = self.problem.allowed(np.zeros(len(scaled)), scaled)
         return self._joined([*active], scaled, starts, self.problem.noise, 2, thorough, enough)
+
+    def played(self, scaled: Floats) -> Floats:
+        """Return how far runs that are played from their first row are from the measurements.
+
+        Their start states are guessed from the measurements. It is the root mean square of each
+        column, with scaled parameters and without a fit, shape (2, columns).
+        """
+        problem, plain = self.problem, np.ones(len(self.problem.measured.columns))
+        windows, column = windows_of(problem.measured.runs, None), problem.measured.cells[1]
+        pairs = zip(problem.segments, self._guess, strict=True)
+        starts = [start for segment, start in pairs if not segment.first]
+
+        def sizes(numbers: Floats) -> Floats:
+            tasks = [(one, numbers, start) for one, start in zip(windows, starts, strict=True)]
+            made = zip(windows, problem.simulator.simulate(tasks), strict=True)
+            left = np.concatenate([problem.residual(one, it.values, plain) for one, it in made])
+            return np.sqrt(np.divide(*by_column(column, left**2, len(plain))))
+
+        if self._unfitted is None:
+            self._unfitted = sizes(np.zeros(len(scaled)))
+        return np.array([sizes(scaled), self._unfitted])
 
     def repeated(
         self,

@@ -13,7 +13,14 @@ from numpy.typing import NDArray
 from scm_world._types import Floats, Integers
 from scm_world.errors import EngineFailure
 from scm_world.fit.problem import SHORT, STEP, Simulated, Simulator, Window
-from scm_world.fit.recordings import LEAST, Measurements, RecordedRun, rotations_of
+from scm_world.fit.recordings import (
+    LEAST,
+    Measurements,
+    RecordedRun,
+    labels,
+    rotations_of,
+    settable_of,
+)
 from scm_world.fit.targets import (
     Target,
     begin,
@@ -79,7 +86,16 @@ class Shooting(Simulator):
         self._places = np.array([places[c.variable].start + c.component for c in self.columns])
         self._begins = range(len(measured.recorded), len(self.columns))
         self.rotations = rotations_of(first, measured.recorded)
-        written = {target.variable for target in targets if target.values is not None}
+        begin(first, world)
+        self._places_of = {
+            label: (name, i)
+            for name, variable in settable_of(first).items()
+            for i, label in enumerate(labels(name, variable.shape))
+        }
+        self._setups = [*dict.fromkeys(tuple(run.do.items()) for run in self.runs)]
+        names = {self._places_of[label][0] for setup in self._setups for label, _ in setup}
+        self._usual = {name: np.array(first[name], float) for name in names}
+        written = names.union(t.variable for t in targets if t.values is not None)
         acting = written.union(*map(first.model.descendants, written))
         follow = [name for name in first.compiled.static_names if name in acting]
         keys = first.compiled.parameter_keys
@@ -217,11 +233,21 @@ class Shooting(Simulator):
             vector[world.compiled.slices[name].start + 2] += LIFT * (1 + i)
         return vector
 
-    def _write(self, world: Simulation, scaled: Floats) -> None:
-        """Set the parameters of a twin, which is in any state afterwards."""
+    def _write(self, world: Simulation, scaled: Floats, setup: Iterable[tuple[str, float]]) -> None:
+        """Set the parameters of a twin for a set-up; it is in any state afterwards."""
         if self._apart is not None:
             self._place(world, self._apart)
-        world.do(values_of(self.targets, scaled))
+        usual = {name: values.copy() for name, values in self._usual.items()}
+        values = usual | values_of(self.targets, scaled)
+        for label, value in setup:
+            name, place = self._places_of[label]
+            values[name].reshape(-1)[place] = value
+        world.do(values)
+
+    def _key(self, run: int, scaled: Floats) -> bytes:
+        """Return what tells the parameters of a run from others."""
+        setup = tuple(self.runs[run].do.items())
+        return scaled.tobytes() + (b"%d" % self._setups.index(setup)) * bool(self._usual)
 
     def _copy(self, world: Simulation, other: Simulation) -> None:
         """Set the parameters of a twin to those of another one."""
@@ -258,7 +284,9 @@ class Shooting(Simulator):
 
     def simulate(self, tasks: Sequence[tuple[Window, Floats, Floats]]) -> list[Simulated]:
         """Simulate windows; see ``Simulator``."""
-        order = sorted(range(len(tasks)), key=lambda i: (tasks[i][1].tobytes(), i))
+        order = sorted(
+            range(len(tasks)), key=lambda i: (self._key(tasks[i][0].run, tasks[i][1]), i)
+        )
         turns = -(-len(tasks) // len(self._batch))
         n = -(-len(tasks) // turns)  # parameters are written to no more twins than needed
         shares = [part.tolist() for part in np.array_split(np.array(order, int), n)]
@@ -300,16 +328,16 @@ class Shooting(Simulator):
             world = self._batch.world(row)
             if self._set[row] == LOST:
                 begin(world, self.world)
-            if self._set[row] != scaled.tobytes():
-                alike = self._set.index(scaled.tobytes()) if scaled.tobytes() in self._set else None
+            run, key = self.runs[window.run], self._key(window.run, scaled)
+            if self._set[row] != key:
+                alike = self._set.index(key) if key in self._set else None
                 self._set[row] = b"?"
                 if alike is None:
-                    self._write(world, scaled)
+                    self._write(world, scaled, run.do.items())
                 else:
                     self._copy(world, self._batch.world(alike))
-                self._set[row] = scaled.tobytes()
+                self._set[row] = key
             self._place(world, vector)
-            run = self.runs[window.run]
             since = run.instants[window.first]
             end = run.instants[min(window.last, len(run.instants) - 1)]  # where the next one begins
             commands[row] = self._commands(run, scaled, np.arange(since, end))
@@ -353,7 +381,8 @@ class Shooting(Simulator):
         if self._set[0] == LOST:
             begin(world, self.world)
         self._set[0] = b"?"
-        self._write(world, scaled)
+        for setup in self._setups:
+            self._write(world, scaled, setup)
 
     def replay(
         self,
@@ -392,7 +421,7 @@ class Shooting(Simulator):
             chunk = scaled[first : first + len(self._batch)]
             sent = {row: self._commands(run, one, steps) for row, one in enumerate(chunk)}
             for row, one in enumerate(chunk):
-                self._write(self._batch.world(row), one)
+                self._write(self._batch.world(row), one, run.do.items())
                 # do() would begin the episode again
                 self._batch.world(row).advance(run.commands[0])
 

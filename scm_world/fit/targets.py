@@ -12,8 +12,8 @@ import numpy as np
 
 from scm_world._patterns import as_names, fitting
 from scm_world._types import ArrayLike, Floats, Integers
-from scm_world.errors import NotIntervenable, UnknownVariable
-from scm_world.fit.recordings import MeasuredNumber, labels
+from scm_world.errors import NotIntervenable, UnknownOption, UnknownVariable
+from scm_world.fit.recordings import MeasuredNumber, labels, settable_of
 from scm_world.queries.twins import twins_of
 from scm_world.queries.world import World
 from scm_world.variables import Box
@@ -42,7 +42,8 @@ class Target:
         log: Whether the scaled number is the logarithm of value : default.
         low: Lower end of its range, scaled.
         high: Upper end, scaled.
-        whole: Whether all components keep their proportions to this one: those of an inertia.
+        whole: Whether all components keep their proportions to this one: those of an inertia, or
+            the two ends of a symmetric range.
         values: All numbers of the variable in the world; None for a delay, which the world lacks.
     """
 
@@ -120,7 +121,9 @@ def ranges_of(targets: Sequence[Target]) -> tuple[Floats, Floats]:
     return np.array([t.low for t in targets]), np.array([t.high for t in targets])
 
 
-def targets_of(world: Simulation, patterns: Iterable[str]) -> tuple[Target, ...]:
+def targets_of(
+    world: Simulation, patterns: Iterable[str], *, symmetric: bool = False
+) -> tuple[Target, ...]:
     """Return the fitted numbers that some patterns of parameters name.
 
     A parameter that cannot be negative is scaled by its logarithm, any other one by its default, or
@@ -130,15 +133,20 @@ def targets_of(world: Simulation, patterns: Iterable[str]) -> tuple[Target, ...]
     Args:
         world: A twin of the world, at the beginning of an episode.
         patterns: Patterns of names of parameters, or of their components.
+        symmetric: Whether ranges [-a, a] stay symmetric: one number, the upper end.
 
     Raises:
+        UnknownOption: No such range is fitted, although ``symmetric`` asks for it.
         UnknownVariable: A pattern fits no parameter.
         NotIntervenable: A pattern fits another variable, or a parameter that cannot be changed.
     """
     model, given = world.model, as_names(patterns)
-    known = {n: n for n in world.compiled.static_names if _can_be_fitted(world, n)}
+    known = {name: name for name in settable_of(world)}
     parts = {label: n for n in known for label in labels(n, model.declared(n).shape)}
-    names = dict[str, None]()
+    names, mirrored = dict[str, None](), set[str]()
+    if symmetric:
+        pairs = ((n, np.array(world[n], float)) for n in known if model.declared(n).shape == (2,))
+        mirrored = {name for name, (low, high) in pairs if -low == high > 0.0}
     refused = world.composition.system.refused
     late = {f"{name}{LATE}" for name in world.compiled.actions}.difference(model)
     late |= {DELAY}.difference(model) if world.compiled.n_actions else set()
@@ -158,16 +166,18 @@ def targets_of(world: Simulation, patterns: Iterable[str]) -> tuple[Target, ...]
             continue
         found = fitting(pattern, known if pattern in known else {**known, **parts})
         for name in found:
-            joint = name not in known or _kind(world, name) == "inertia"
+            joint = name not in known or name in mirrored or _kind(world, name) == "inertia"
             parts_of_it = (name,) if joint else labels(name, model.declared(name).shape)
             names |= dict.fromkeys(parts_of_it)
+    if symmetric and mirrored.isdisjoint(names):
+        raise UnknownOption("symmetric", True, (f"a range [-a, a] among {', '.join(names)}",))
     targets = []
     for name in names:
         if name in late:
             unit, one = ("s", world.options.control_period) if name == DELAY else ("1", 1.0)
             targets.append(Target(name, name, 0, unit, 0.0, one, False, 0.0, LONGEST_DELAY))
             continue
-        whole = name in known and _kind(world, name) == "inertia"
+        whole = name in mirrored or (name in known and _kind(world, name) == "inertia")
         variable = model.declared(known.get(name) or parts[name])
         values = np.array(world[variable.name], dtype=float)
         vector = values.ravel()
@@ -176,6 +186,7 @@ def targets_of(world: Simulation, patterns: Iterable[str]) -> tuple[Target, ...]
         if isinstance(variable.bounds, Box):
             ends = variable.bounds.bounds(variable.shape, world.evaluate(()))
             low, high = (float(np.ravel(end)[place]) for end in ends)
+        low = 0.0 if name in mirrored else low
         scale = abs(default) or float(np.abs(vector).max()) or UNSEEN
         log = low >= 0.0 and default > 0.0
         if log:
@@ -193,17 +204,10 @@ def acting(world: Simulation, columns: Iterable[MeasuredNumber]) -> list[str]:
     graph, measured = world.model, {column.variable for column in columns}
     found = [
         name
-        for name in world.compiled.static_names
-        if name != TIMESTEP and _can_be_fitted(world, name)
-        if not measured.isdisjoint(graph.descendants(name))
+        for name in settable_of(world)
+        if name != TIMESTEP and not measured.isdisjoint(graph.descendants(name))
     ]
     return [*found, *((DELAY,) if world.compiled.n_actions else ())]
-
-
-def _can_be_fitted(world: Simulation, name: str) -> bool:
-    """Return whether a variable is a parameter of real numbers that can be set."""
-    variable = world.model.declared(name)
-    return variable.is_root and variable.settable and variable.dtype == "real"
 
 
 def _kind(world: Simulation, name: str) -> str:

@@ -453,6 +453,9 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         noise: Any = None,
         window: int | None = None,
         begins: Any = None,
+        held_out: float | None = None,
+        setups: Sequence[Mapping[str, object]] | None = None,
+        symmetric: bool = False,
         progress: Progress | None = None,
         search: Search | None = None,
     ) -> Fit:
@@ -484,6 +487,12 @@ class World(Planned, _System, Questions, metaclass=_Opener):
             begins: How the recording begins, where that was not measured: ``"rest"`` (velocities 0,
                 activations at what they follow, the first command, to 0.001), or values and
                 standard deviations by patterns of states, ``{"*.velocity": (0.0, 0.01)}``.
+            held_out: Share of the rows at the end of each run that are not fitted, but predicted:
+                ``fit.held_out``.
+            setups: The set-up of each of several recordings: values of parameters that were set for
+                it, ``[{}, {"weight.mass": 1.0}]``. A recording may carry its own: a column
+                ``do.weight.mass``, or arrays by name with ``"do": {"weight.mass": 1.0}``.
+            symmetric: Whether ranges [-a, a], such as those of forces, stay symmetric.
             progress: Called after each round of estimating the noise.
             search: What finds the next minimum of least squares; ``gauss_newton`` if None. See
                 ``scm_world.fit.Search``.
@@ -505,7 +514,9 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         """
         from scm_world.fit import fit
 
-        options: Any = {"noise": noise, "window": window, "begins": begins, "progress": progress}
+        options: Any = {"noise": noise, "window": window, "begins": begins}
+        options |= {"held_out": held_out, "setups": setups, "progress": progress}
+        options |= {"symmetric": symmetric}
         options |= {} if search is None else {"search": search}
         return fit(self, recording, parameters, **options)
 
@@ -519,6 +530,7 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         noise: Any = None,
         window: int | None = None,
         begins: Any = None,
+        setups: Sequence[Mapping[str, object]] | None = None,
         progress: Progress | None = None,
     ) -> Deviation:
         """Find which parameter accounts for the deviation of a recording from this world.
@@ -538,6 +550,7 @@ class World(Planned, _System, Questions, metaclass=_Opener):
             noise: See ``fit``.
             window: Number of rows of a window; 50 if None.
             begins: See ``fit``.
+            setups: See ``fit``.
             progress: Called after each fit.
 
         Raises:
@@ -545,8 +558,8 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         """
         from scm_world.fit import explain
 
-        options: Any = {"most": most, "noise": noise, "window": window, "begins": begins}
-        return explain(self, recording, candidates, progress=progress, **options)
+        options: Any = {"noise": noise, "window": window, "begins": begins, "setups": setups}
+        return explain(self, recording, candidates, most=most, progress=progress, **options)
 
     def for_fit(self, recording: object) -> World:
         """Return the world that a fit computes: of equations, that of their step function."""

@@ -654,10 +654,11 @@ def test_the_command(damped: pd.DataFrame, tmp_path: Path, monkeypatch: Any) -> 
     words = ["fit", "pendulum.xml", "run.csv", "more.parquet", "--out", "out"]
     more = ["--parameters", "*.damping", "--noise", "hinge.position=0.001"]
     asked = ["--suggest", "1", "--steps", "40", "--limits", "hinge.position=-2,2"]
-    asked += ["--do", "pole.mass=0.3", "--at", "10", "--run", "1"]
+    asked += ["--do", "pole.mass=0.3", "--at", "10", "--run", "1", "--predict", "run.csv"]
+    asked += ["--begins", "hinge.velocity=0,1", "--held-out", "0.3"]
     done = CliRunner().invoke(app, [*words, *more, *asked], catch_exceptions=False)
     assert done.exit_code == 0, done.output
-    assert "2 runs of 192 rows, 3.8 s, 1 measured column" in done.output
+    assert "2 runs of 135 rows, 2.66 s, 1 measured column" in done.output
     assert "hinge.damping" in done.output
     assert "experiment 1: 40 control steps (0.8 s)" in done.output
     assert "with pole.mass=0.3 from 10 on" in done.output
@@ -666,6 +667,10 @@ def test_the_command(damped: pd.DataFrame, tmp_path: Path, monkeypatch: Any) -> 
     found = json.loads(Path("out/result.json").read_text())
     assert found["fit"][0]["value"] == pytest.approx(0.02, rel=0.02)
     assert found["backend"] == "mujoco"
+    assert found["replay"][0]["fit"] < 0.3 * found["replay"][0]["constant"]
+    assert {*found["predictions"]} == {"run.csv", "held out"}
+    assert found["predictions"]["run.csv"][0]["skill"] > 0.9
+    assert "hinge.velocity at the start" in found["noise"]
     assert {"seed", "versions", "noise", "remarks"} <= {*found}
     assert {*(path.name for path in Path("out").iterdir())} == {
         *("result.json", "residuals.csv", "fit.png", "experiment-1.csv", "counterfactual.csv")

@@ -166,6 +166,19 @@ def test_limits_of_a_force_that_are_not_reached_are_bounded_on_one_side() -> Non
     assert high.high == np.inf
     assert (low.determined, high.determined, kp.determined) == (False, False, True)
     assert kp.low < 30.0 < kp.high
+    one = world.fit(recording, ["s.forcerange"], symmetric=True)
+    assert [*one.table.parameter] == ["s.forcerange"]
+    assert max(-low.high, high.low) < one.table.low[0] < 2.0
+    assert one.table.high[0] == np.inf
+    strong = np.repeat(np.random.default_rng(1).uniform(-1.0, 1.0, 5), 6)[:, None]
+    episode = world.rollout(strong, seed=1, steps=30, do={"s.forcerange": [-2.0, 2.0]})
+    recording |= {"s.control": strong[:, 0], "j.position": episode["j.position"]}
+    one = world.fit(recording, ["s.forcerange"], symmetric=True, noise=1e-3)
+    assert one.values == pytest.approx({"s.forcerange": 2.0}, rel=1e-3)
+    one.world.reset(seed=0)
+    np.testing.assert_allclose(one.world["s.forcerange"], [-2.0, 2.0], rtol=1e-3)
+    with pytest.raises(sw.errors.UnknownOption, match="symmetric"):
+        world.fit(recording, ["s.kp"], symmetric=True)
 
 
 def test_a_number_of_a_vector_deviates_alone() -> None:

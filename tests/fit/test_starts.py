@@ -25,13 +25,25 @@ NOISE = 2e-3  # [rad]
 NAMES = ["servo.kp", "hinge.damping"]
 
 
-def moved(kp: float, steps: int = 40, seed: int = 0, at: float = 0.4) -> dict[str, Any]:
+def with_gain(kp: float) -> str:
+    """Return the servo with another gain."""
+    return SERVO.replace('gainprm="2"', f'gainprm="{kp}"').replace("0 -2 0", f"0 {-kp} 0")
+
+
+def moved(
+    kp: float,
+    steps: int = 40,
+    seed: int = 0,
+    at: float = 0.4,
+    most: float = 0.8,
+    friction: float = 0.0,
+) -> dict[str, Any]:
     """Return a recording by plain MuJoCo: a servo that stands, and follows commands."""
-    text = SERVO.replace('gainprm="2"', f'gainprm="{kp}"').replace("0 -2 0", f"0 {-kp} 0")
-    model = mujoco.MjModel.from_xml_string(text)
+    model = mujoco.MjModel.from_xml_string(with_gain(kp))
+    model.dof_frictionloss[0] = friction
     data, rng = mujoco.MjData(model), np.random.default_rng(seed)
     data.qpos[0] = data.act[0] = at
-    commands = np.repeat([at, *rng.uniform(-0.8, 0.8, steps // 10 - 1)], 10)
+    commands = np.repeat([at, *rng.uniform(-most, most, steps // 10 - 1)], 10)
     seen = [at]
     for command in commands:
         data.ctrl[0] = command
@@ -86,3 +98,62 @@ def test_wrong_starts_are_refused() -> None:
             world.fit(recording, NAMES, begins=wrong)
     with pytest.raises(UnknownVariable, match=r"knee\.velocity"):
         world.fit(recording, NAMES, begins={"knee.velocity": (0.0, 0.1)})
+
+
+def test_a_fit_that_replays_worse_than_the_file_determines_nothing() -> None:
+    """Short windows hide friction that is not modelled; plain MuJoCo has the same replays."""
+    world, recording = sw.World(SERVO), moved(2.0, 100, friction=0.1, at=0.0, most=0.3)
+    fit = world.fit(recording, NAMES)
+    replay = fit.replay.iloc[0]
+    for kind, kp, damping in (("fit", *fit.values.values()), ("unfitted", 2.0, 0.05)):
+        model = mujoco.MjModel.from_xml_string(with_gain(kp))
+        model.dof_damping[0] = damping
+        data, played = mujoco.MjData(model), []
+        seen, time = recording["hinge.position"], recording["time"]
+        data.qpos[0] = seen[0]
+        data.qvel[0] = np.polyfit(time[:4], seen[:4], 1)[0]
+        for command in recording["servo.control"]:
+            played.append(float(data.qpos[0]))
+            data.ctrl[0] = command if np.isfinite(command) else 0.0
+            mujoco.mj_step(model, data, 10)
+        rms = float(np.sqrt(((seen - played) ** 2).mean()))
+        assert replay[kind] == pytest.approx(rms, rel=1e-6)
+    assert replay.constant == pytest.approx(float(np.std(recording["hinge.position"])))
+    assert replay.fit > 2.0 * replay.unfitted
+    assert fit.table.high[0] < 2.0  # the true gain is excluded
+    assert fit.worse
+    assert not fit.table.determined.any()
+    assert "the unfitted world is nearer to the recording than the fit" in str(fit)
+
+
+def test_what_was_held_out_is_predicted() -> None:
+    """The skill is that of the errors of windows, and a fit of nothing is no better."""
+    world, recording = sw.World(SERVO), moved(2.6, 400)
+    fit = world.fit(recording, NAMES, held_out=0.6)
+    assert fit.read.startswith("a run of 160 rows")
+    found = fit.held_out
+    assert found is not None
+    assert len(found.windows) == 5  # of 50 rows
+    assert found.windows.time[0] == pytest.approx(0.02 * 170)
+    rows = found.windows
+    squares = [float((rows[kind] ** 2 * rows.rows).sum()) for kind in ("fit", "unfitted")]
+    assert found.table.skill[0] == pytest.approx(1.0 - squares[0] / squares[1])
+    assert found.table.low[0] > 0.99
+    assert found.table.fit[0] < 2.0 * NOISE
+    assert found.better
+    assert "held out: 5 windows that do not overlap, predicted up to 0.8 s ahead" in str(fit)
+    last = recording["hinge.position"]
+    known = np.concatenate([last[i + 10 : i + 50] - last[i + 9] for i in range(160, 360, 50)])
+    assert rows.constant[:4].pow(2).mean() == pytest.approx(float((known**2).mean()))
+    other = fit.predict(moved(2.6, 200, seed=5), ahead=0.2)
+    assert len(other.windows) == 10  # of 20 rows, of which 10 are known
+    assert other.better
+    same = fit.predict(moved(2.0, 200, seed=5))
+    assert not same.better
+    assert "no better than the unfitted world" in str(same)
+    assert world.fit(recording, NAMES, window=40).held_out is None
+    for wrong in (0.0, 1.0, 0.01):
+        with pytest.raises(UnknownOption, match="held_out"):
+            world.fit(recording, NAMES, held_out=wrong)
+    with pytest.raises(UnknownOption, match="more than 10 rows"):
+        fit.predict({name: values[:10] for name, values in recording.items()})
