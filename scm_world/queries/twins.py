@@ -47,6 +47,7 @@ class Twins:
     def __init__(self, system: CausalSystem) -> None:
         compiled, engine = system.compiled, system.backend
         self.model = compiled if isinstance(compiled, CompiledModel) else None
+        self.has_engine = engine is not None
         self.is_exact = engine is None or not engine.capabilities.floor
         self.scenes = None if engine is None else engine.capabilities.scenes
         self._floors: dict[str, tuple[int, list[Floats]]] = {}  # with the number of units
@@ -193,11 +194,11 @@ class Twins:
             self._floors[key] = some, largest
         return largest
 
-    def require_exact(self, question: str) -> None:
+    def require_exact(self, question: str, *, independent: bool = False) -> None:
         """Refuse a question that compares equal runs bit for bit; see ``Simulation``."""
-        if not self.is_exact:
+        if not self.is_exact or (independent and self.has_engine):
             with self.twin() as system:
-                system.require_exact(question)
+                system.require_exact(question, independent=independent)
 
     def episode(self, unit: Unit) -> Episode:
         """Run a unit in a twin."""

@@ -337,7 +337,8 @@ class CompiledTask(Vectors):
             columns.append(self._take(np.size(value)))
             self._written.append((columns[-1], value))
         where = [(at.start, at.stop) for at in (*columns, self.where[name])]
-        return [*steps, CompiledStep(found, np.array(where), called)]
+        vectors = (*(kind == VECTOR for kind in kinds), variable.shape != ())
+        return [*steps, CompiledStep(found, np.array(where), called, vectors)]
 
     def needed(self, names: Iterable[str]) -> tuple[str, ...]:
         """List the computed variables on which some names and the memory depend, causes first."""
@@ -361,6 +362,18 @@ class CompiledTask(Vectors):
             steps = [step for name in wanted for step in self._steps[name]]
             found = self._programs[names] = program_of([*steps, *self._mark])
         return found
+
+    @property
+    def constants(self) -> dict[int, float]:
+        """The values of columns that have the same one in all worlds, by column."""
+        found: dict[int, float] = {}
+        for place, value in self._written[1:]:
+            found |= zip(range(place.start, place.stop), np.ravel(value).tolist(), strict=True)
+        return found
+
+    def steps_of(self, name: str) -> list[Step]:
+        """Return the steps that compute a variable from others, last what marks that it is done."""
+        return self._steps[name]
 
     @property
     def plan(self) -> Plan:

@@ -166,11 +166,15 @@ class Rows(Mapping[str, Value]):
 @final
 @dataclass(frozen=True, eq=False)
 class CompiledStep:
-    """A step of a program; see ``run``. It keeps a reference to the function of its address."""
+    """A step of a program; see ``run``. It keeps a reference to the function of its address.
+
+    ``vectors`` says which of its arguments, and last its result, are vectors.
+    """
 
     addresses: tuple[int, int]
     where: Integers
-    function: object = None
+    function: Any = None
+    vectors: tuple[bool, ...] = ()
 
 
 @final
@@ -181,6 +185,7 @@ class PythonStep:
         self, compiled: CompiledTask, name: str, variable: Any, columns: list[slice]
     ) -> None:
         self._variable, self._place = variable, compiled.where[name]
+        self.reads, self.writes = columns, self._place
         self._is_number = variable.shape == () and not variable.bounds
         self._clock = compiled.where[CONTROL_INDEX].start
         home = getattr(variable.equation, "reference", PACKAGE).partition(":")[0]

@@ -670,7 +670,8 @@ class Simulation(CausalSystem):
         acts = {name: model._act_on(name) for name in self.compiled.actions}
         roots = {name: act.root for name, act in acts.items() if act is not None}
         self.graph, self._held_actions = model, tuple(roots)
-        self.acts_alone = self._translates or bool(roots)
+        self.holds_actions = bool(roots)
+        self.acts_alone = self._translates or self.holds_actions
         follow = (of.intervention.follows(of.requested) for of in roots.values())
         self._inputs = tuple(p.name for parents in follow for p in parents)
 
@@ -748,7 +749,9 @@ class Simulation(CausalSystem):
             self.structures.task.on(other)
             other.build(self.structure.default_scene())
 
-        require_exact(self.backend, question, takes, independent=independent)
+        require_exact(
+            self.backend, question, takes, independent=self.structure if independent else None
+        )
 
     def require_state(self) -> None:
         """Refuse to continue without an episode, or from a state that the backend has lost."""

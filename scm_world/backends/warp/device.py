@@ -23,8 +23,9 @@ from mujoco_warp._src import types
 from numpy.typing import NDArray
 from warp._src.logger import get_logger
 
-from scm_world._types import Integers
+from scm_world._types import Floats, Integers
 from scm_world.errors import ModelError, UnknownOption
+from scm_world.models.model import REPORTED, Model
 
 GROWS = int(
     OverflowType.NEFC
@@ -251,6 +252,37 @@ class SharedModel:
         with quiet(device, compiles=True), wp.ScopedDevice(device):
             mjw.step(self.model, mjw.make_data(self.mj, 1, nconmax=self.contacts, njmax=self.rows))
 
+    def coupling(self, structure: Model, substeps: int) -> Floats:
+        """Return how far bodies that do not touch may move each number of a state in a step.
+
+        One solver computes all accelerations a of a world, and stops at an improvement of its cost
+        below its tolerance t times the trace of the mass matrix M, so that a is within
+        (2 t tr(M) M⁻¹ᵢᵢ)^½ of the solution, and two runs are twice as far apart.
+
+        Source:
+            ``_solve_done`` and ``_inertia_scale`` of mujoco-warp 4.0.0; ``dof_invweight0`` is the
+            diagonal of M⁻¹.
+        """
+        mj, found = self.mj, np.zeros(structure.layout.size)
+        if mj.ntree < 2:
+            return found
+        tolerance = float(self.model.opt.tolerance.numpy()[0])
+        trace, step = mj.stat.meaninertia * mj.nv, mj.opt.timestep
+        faster = 2.0 * substeps * step * np.sqrt(2.0 * tolerance * trace * mj.dof_invweight0)
+        moved = faster * step * (substeps + 1) / 2.0
+        data, moment = mujoco.MjData(mj), np.zeros((mj.nu, mj.nv))
+        mujoco.mj_forward(mj, data)
+        rows = data.moment_rownnz, data.moment_rowadr, data.moment_colind
+        mujoco.mju_sparse2dense(moment, data.actuator_moment, *rows)
+        arms, bias = np.abs(moment), np.abs(mj.actuator_biasprm)
+        force = arms.T @ (bias[:, 1] * (arms @ moved) + bias[:, 2] * (arms @ faster))
+        ends = np.append(mj.jnt_qposadr[1:], mj.nq) - mj.jnt_qposadr
+        position = np.repeat(np.maximum.reduceat(moved, mj.jnt_dofadr), ends)
+        for array, sizes in (("qpos", position), ("qvel", faster), (REPORTED, force)):
+            numbers, places = structure.places(array)
+            found[places] = sizes[numbers]
+        return found
+
 
 # --- states ---------------------------------------------------------------------------------------
 
@@ -366,6 +398,12 @@ class Engine:
                 self._graphs = {}
 
     def step(self, substeps: int) -> None:
+        """Take some physics steps in all worlds, and copy their states to the host."""
+        self.launch(substeps)
+        for column in self.state.values():
+            column.pull()
+
+    def launch(self, substeps: int) -> None:
         """Take some physics steps in all worlds: a captured graph, on a GPU of all of them."""
         self.launched += 1
         with wp.ScopedDevice(self.base.device):
@@ -377,8 +415,6 @@ class Engine:
                 self._graphs[once] = capture.graph
             for _ in range(substeps // once):
                 wp.capture_launch(self._graphs[once])
-        for column in self.state.values():
-            column.pull()
 
     def grow(self, over: Integers) -> tuple[bool, list[int]]:
         """Make more memory after an overflow.

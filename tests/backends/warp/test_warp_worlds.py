@@ -56,7 +56,7 @@ def test_each_world_has_its_own_constants(worlds: Any) -> None:
     assert [audit.targets["crate.mass"].read_back for audit in audits.values()] == masses.tolist()
     group, mujoco = _group(worlds), sw.World(MODEL)
     mujoco.reset(seed=0)
-    engine = group._synced()
+    engine = group.synced()
     for row, mass in enumerate(masses.tolist()):
         mujoco.do({"crate.mass": mass})
         model = mujoco.backend.realization.model
