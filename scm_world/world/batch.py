@@ -111,11 +111,7 @@ class WorldsInRows(ABC):
     ) -> Audits: ...
 
     def _numbered(self, index: int) -> int:
-        row = whole_number("world", index, least=0)
-        if row >= len(self):
-            allowed = (f"any whole number from 0 to {len(self) - 1}",)
-            raise UnknownOption("world", index, allowed)
-        return row
+        return whole_number("world", index, least=0, most=len(self) - 1)
 
     def __enter__(self) -> Self:
         return self
