@@ -41,7 +41,7 @@ from scm_world import (
     variables,
 )
 from scm_world import env as environments
-from scm_world.discovery import benchmarks, data, learners, problems, representations
+from scm_world.discovery import data, learners, problems, representations
 from scm_world.errors import ModelError, ScmWorldError
 from scm_world.policies import planning
 from scm_world.queries.local import local_graph
@@ -490,19 +490,6 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
     yield sw.load_hull, {"path": folder / "none.obj", "scale": 1.0}
 
 
-class _Here:
-    """Does the jobs of a benchmark in this process."""
-
-    def __init__(self, work: Callable[..., Any]) -> None:
-        self._work = work
-
-    def ask(self, *job: Any, timeout: float | None = None) -> Any:
-        return self._work(*job)
-
-    def close(self) -> None:
-        pass
-
-
 class _TooSlow(BaseException):
     """A call that went on for too long."""
 
@@ -560,11 +547,11 @@ def _only_keeps(one: Any) -> bool:
     return not inspect.signature(one).parameters
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_wrong_arguments_end_in_typed_errors(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each call with one wrong argument ends, in a result or one of our errors."""
-    monkeypatch.setattr(benchmarks, "Worker", _Here)
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")  # a text may be the name of a file to write
     faults, called = [], set()

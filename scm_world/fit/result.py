@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, final
@@ -19,6 +19,7 @@ from scm_world.fit.problem import (
     SHORT,
     WINDOW,
     LinearWindow,
+    Outlier,
     by_column,
     degrees,
     projected,
@@ -30,6 +31,7 @@ from scm_world.fit.recordings import (
     Limits,
     MeasuredNumber,
     Measurements,
+    Reading,
     RecordedRun,
     at_rest,
     columns_of,
@@ -61,6 +63,7 @@ DETERMINED = 0.25  # largest standard error of a determined combination: a share
 MISFIT = 1.5  # least residual that the noise does not explain, in standard deviations of it
 AWAY = 0.5  # of the spread of a state in the recording, at which it is far from rest
 WORSE = 1.1  # times the error of the unfitted world, with which a fit replays worse than it
+SHOWN = 5  # outliers that are named
 MAIN = 0.3  # least share of a parameter in a combination that is named
 DRAWN = 8  # columns of a picture
 
@@ -86,6 +89,8 @@ class Fit:
         ended: Whether the search took all its steps before it found a minimum.
         played: See ``replay``, of the fit and the unfitted world, (2, columns).
         later: The rows that were held out.
+        outliers: Measurements that were left out: no noise of the others leaves them.
+        reading: Another reading of one column that the world follows far better, in words.
 
     Example:
         >>> from scm_world.queries import World
@@ -115,6 +120,8 @@ class Fit:
     ended: bool = False
     played: Floats | None = None
     later: Measurements | None = None
+    outliers: tuple[Outlier, ...] = ()
+    reading: str = ""
 
     @property
     def runs(self) -> tuple[RecordedRun, ...]:
@@ -416,7 +423,14 @@ class Fit:
         return unfitted < min(1.0, fit / WORSE)
 
     @typed
-    def predict(self, recording: object, *, ahead: float | None = None) -> Prediction:
+    def predict(
+        self,
+        recording: object,
+        *,
+        ahead: float | None = None,
+        columns: Mapping[str, str] | None = None,
+        ignore: Iterable[str] = (),
+    ) -> Prediction:
         """Predict another recording, beside the world that was asked and a constant.
 
         It is cut into windows that do not overlap. The fitted and the unfitted world each begin
@@ -425,13 +439,16 @@ class Fit:
         Args:
             recording: The recording, of the kinds of ``World.fit``.
             ahead: How far to predict [s]; 40 rows if None, or as a window of the fit.
+            columns: See ``World.fit``.
+            ignore: See ``World.fit``.
 
         Raises:
             UnknownOption: No window has a row to predict.
             ModelError: The recording has faults.
         """
         with twin_of(self.asked) as twin:
-            return predicted(self, read_recording(twin, recording), ahead)
+            how = Reading(None, columns, ignore)
+            return predicted(self, read_recording(twin, recording, how), ahead)
 
     @cached_property
     def held_out(self) -> Prediction | None:
@@ -474,6 +491,18 @@ class Fit:
             f"no experiment of this model seems to determine {name}: it changes {tried}"
             for name in self.unseen
         ]
+        for run, row, column, value, off in sorted(self.outliers, key=lambda o: -abs(o.off))[
+            :SHOWN
+        ]:
+            time = self.runs[run].begin + self.measured.control_dt * self.runs[run].instants[row]
+            where = f"row {row}" + f" of run {run}" * (len(self.runs) > 1) + f" ({time:.4g} s)"
+            found.append(
+                f"{self.columns[column].name} = {value:.4g} in {where} is {off:.3g} from "
+                f"the fit, {abs(off) / self.noise[column]:.3g} times the noise: it was left out"
+            )
+        if len(self.outliers) > SHOWN:
+            found.append(f"{len(self.outliers)} measurements were left out; fit.outliers has all")
+        found += [self.reading] * bool(self.reading)
         groups = [tuple(n for n in names if n not in self.unseen) for names in self.confounded]
         if self.worse:
             found.append(

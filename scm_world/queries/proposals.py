@@ -18,7 +18,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy import special, stats
+from scipy import special
 
 from scm_world._types import Floats
 from scm_world.variables import Box, Continuous, Normal
@@ -58,6 +58,8 @@ def noise_of(source: Any, scores: Floats) -> Floats:
 def _frozen(source: Box | Continuous, shape: tuple[int, ...]) -> Any:
     if isinstance(source, Continuous):
         return source.frozen
+    from scipy import stats  # takes half a second
+
     low, high = source.bounds(shape, {})
     return stats.uniform(low, np.asarray(high) - low)
 

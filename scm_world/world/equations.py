@@ -225,7 +225,7 @@ class Equations(CausalSystem):
             table.settle(self)
             return vars(self)[name]
 
-    def __deepcopy__(self, memo: Any) -> Self:
+    def __deepcopy__(self, memo: dict[int, object]) -> Self:
         found = copy(self)
         vars(found).update({name: getattr(self, name) for name in LATE})
         return found  # its parts are replaced, never changed

@@ -18,7 +18,8 @@ from scm_world.queries import Outcome, World
 from scm_world.queries import twins as parallel
 from scm_world.queries.episodes import Episode, Unit
 from scm_world.queries.samples import Setting
-from scm_world.queries.twins import Twins, is_known, run_together, twins_of
+from scm_world.queries.together import is_known, run_together
+from scm_world.queries.twins import Twins, twins_of
 from scm_world.variables import Contact, Hard, Null, Reaches
 
 BULLET = pytest.mark.skipif(
@@ -74,8 +75,14 @@ def alone(twins: Twins, units: Sequence[Unit]) -> list[Episode | Exception]:
 
 def together(twins: Twins, units: Sequence[Unit], threads: int = 2) -> list[Episode | Exception]:
     """Let units happen at the same time."""
-    with twins.together(len(units), units[0].names, threads) as batch:
-        return run_together(batch, units, twins)
+    found: list[Any] = [None] * len(units)
+    with twins.rows(len(units), units[0].names, threads) as batch:
+        for places, result in run_together(batch, units, twins):
+            for place, one in zip(
+                places, [result] if isinstance(result, Exception) else result, strict=True
+            ):
+                found[place] = one
+    return found
 
 
 def same_values(one: Any, other: Any) -> bool:

@@ -72,7 +72,7 @@ def collect(
         out: A folder, or a URL: new, empty, or one in which this collection was begun. Its files
             are Parquet.
         shard: How many episodes are in one of its files, and run by a worker in one piece. If
-            None, 10,000 of a model; of a world 100, or as many as its engine steps best together
+            None, 10,000 of a model; of a world 500, or as many as its engine steps best together
             (``Capabilities.scenes``).
         progress: Called with how many episodes are done, and how many there will be, after each
             shard.
