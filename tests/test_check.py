@@ -22,6 +22,7 @@ from scm_world.cli.app import app
 from scm_world.env import Check, Checkable, vector_env
 from scm_world.env.answers import QUESTIONS
 from scm_world.env.checks import check
+from scm_world.env.ours import OurWorlds
 from scm_world.errors import ScmWorldError, UnknownOption
 
 MASS = {"mass": (0.5, 2.0)}
@@ -376,6 +377,18 @@ def test_friction_of_a_box_that_rests_is_not_asked() -> None:
     assert not found.faults, str(found)
     assert found.ranges[0].answers["applied"].status == "passed"
     assert found.ranges[0].answers["responds"].status == "not asked"
+
+
+@pytest.mark.slow
+def test_what_acts_in_another_context_alone_is_a_fault_of_who_declares_it() -> None:
+    """The noise of a random wall lays no regular one: a usual range is not asked about it."""
+    with closing(sw.World("stacked_blocks", num_worlds=2)) as worlds:
+        declared = check(worlds, {"wall_noise": sw.Draw("A")}, steps=1)
+        ours = OurWorlds(worlds)
+        ours.declared(None)
+        assert ours.idle("wall_noise", ran=True).endswith("changes here: wall.layout")
+        assert not ours.idle("stack_levels", ran=True)
+    assert [question for _, question, _ in declared.faults] == ["responds"]
 
 
 def test_actions_are_no_ranges() -> None:

@@ -322,9 +322,11 @@ class Asking:
         bit = self._turn % max(1, (self.n - 2).bit_length())
         back = {one for one in loud if one.world >> bit & 1}
         self._changed = []
-        again = self.run(partial(self._act, loud, back), int if alone else self._reset_last)
+        again = first
+        if loud or not all(one.attempt for one in quiet):  # values act late in the first attempt
+            again = self.run(partial(self._act, loud, back), int if alone else self._reset_last)
         for one in quiet:
-            one.gap = self.response(again, base, one)
+            one.gap = None if one.attempt else self.response(again, base, one)
             if one.gap is None:
                 one.attempt += 1
             elif alone:  # the value is in the engine from now on
@@ -544,8 +546,9 @@ class Asking:
             runs = {TARGETS[0]: high, 0.5: middle, 0.0: run(0.0, middle)}
             for low, above in ((0.5, TARGETS[0]), (0.0, 0.5)):
                 for one in left:
-                    if self.gap(runs[low], runs[above], self.only(one), one.name) is None:
-                        ends = (self.value(one, u) for u in (low, above))
+                    ends = self.value(one, low), self.value(one, above)
+                    same = self.gap(runs[low], runs[above], self.only(one), one.name) is None
+                    if same and not np.array_equal(*ends):
                         found[one.name] = "no state differs from {} to {}".format(
                             *map(numbers, ends)
                         )

@@ -22,6 +22,8 @@ from scm_world.world.simulation import READ_BACK
 class OurWorlds(Checkable):
     """Our worlds: values are set by ``do``."""
 
+    given = True  # whether somebody declared ranges
+
     def __init__(self, envs: Any) -> None:
         self.envs, self.is_env = envs, isinstance(envs, ScmWorldVectorEnv)
         self.one: Any = envs.envs[0].unwrapped.world if self.is_env else envs.one
@@ -47,6 +49,7 @@ class OurWorlds(Checkable):
         If there are none, the spaces A of all variables that can be set and vary there.
         """
         model = self.model
+        self.given = ranges is not None
         if ranges is None:
             usual = {v.name: v.a for v in model.variables if v.settable and v.role != "action"}
             return {
@@ -170,7 +173,21 @@ class OurWorlds(Checkable):
         edges = [edge for edge in self.model.edges if edge.cause == name and edge.effect in here]
         if ran and edges and all(edge.when == "contact" for edge in edges):
             return "it acts in contacts, and on none of this run"  # such as a box that rests
+        children = [child for child in self.model.children(name) if child not in here]
+        if ran and not self.given and not edges and self._same(name, children):
+            return f"nothing that follows from it changes here: {', '.join(children)}"
         return ""
+
+    def _same(self, name: str, children: Sequence[str]) -> bool:
+        """Return whether mechanisms give what follows from a variable the same values anyway."""
+        now, space = self.values(0), self.model[name].a
+        known = {n: v for n, v in now.items() if n not in children}
+        for u in TARGETS if space else ():
+            known[name] = at(space, u, self.model[name].shape, now)
+            found = self.model.solve(known, only=children)
+            if any(not np.array_equal(found[child], now[child]) for child in children):
+                return False
+        return bool(children)
 
     def stale(self, name: str) -> dict[str, float] | None:
         """Return derived constants that are not those of a fresh compilation; None without any."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from inspect import signature
@@ -43,7 +44,87 @@ OF_WORLD = frozenset(signature(Simulation).parameters)
 """Options of a world; all others are options of its task."""
 
 
-class Batch:
+class WorldsInRows(ABC):
+    """Many worlds, of which a mask selects those that something is done to."""
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """Return the number of worlds."""
+
+    def values(self, *, where: Mask | None = None) -> dict[str, Value]:
+        """Return the present values of all variables that the selected worlds have.
+
+        Args:
+            where: Boolean mask of the worlds, shape (n,); all if None.
+
+        Returns:
+            By name, shape (m, *shape), with the m selected worlds in their order; as copies.
+
+        Raises:
+            NotReset: No episode has begun in one of them.
+        """
+        return self._values(np.flatnonzero(read_mask("where", where, len(self))))
+
+    @abstractmethod
+    def _values(self, rows: Integers) -> dict[str, Value]: ...
+
+    def do(
+        self,
+        request: Mapping[str, Any],
+        *,
+        where: Mask | None = None,
+        space: AnyRegion | None = None,
+        on_refusal: Literal["raise", "skip"] = "raise",
+    ) -> Audits:
+        """Intervene now in all selected worlds; see ``Simulation.do``.
+
+        It is computed in worlds that are alike together, else in one world after another, with
+        the same bits; see ``RowMemory.ask``.
+
+        Args:
+            request: Values or interventions by name. A value with a leading axis of n worlds, as
+                such or in a ``Hard``, gives one value to each world; others apply to all.
+            where: Boolean mask of the worlds, shape (n,); all if None.
+            space: Space in which every target must lie.
+            on_refusal: With ``"raise"``, no world changes if one of them refuses. With
+                ``"skip"``, those that refuse are unchanged and are listed in ``refused``.
+
+        Returns:
+            The audits by number of the world.
+
+        Raises:
+            InterventionError: It was refused; the message names the world. Nothing has changed.
+            NotReset: No episode has begun in one of the worlds.
+        """
+        one_of("on_refusal", on_refusal, ("raise", "skip"))
+        rows = np.flatnonzero(read_mask("where", where, len(self)))
+        return self._do(request, rows, space, skips=on_refusal == "skip")
+
+    @abstractmethod
+    def _do(
+        self,
+        request: Mapping[str, Any],
+        rows: Integers,
+        space: AnyRegion | None,
+        *,
+        skips: bool = False,
+    ) -> Audits: ...
+
+    def _numbered(self, index: int) -> int:
+        return whole_number("world", index, least=0, most=len(self) - 1)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @abstractmethod
+    def close(self) -> None:
+        """End the episodes of all worlds, and free what they hold."""
+
+
+class Batch(WorldsInRows):
     """Worlds of one task, options and backend, advanced in one call.
 
     The present values of each world are a row in the matrix of all worlds of its structure. A world
@@ -227,19 +308,7 @@ class Batch:
             found[row] = self._alone(row).index
         return found
 
-    def values(self, *, where: Mask | None = None) -> dict[str, Value]:
-        """Return the present values of all variables that the selected worlds have.
-
-        Args:
-            where: Boolean mask of the worlds, shape (n,); all if None.
-
-        Returns:
-            By name, shape (m, *shape), with the m selected worlds in their order; as copies.
-
-        Raises:
-            NotReset: No episode has begun in one of them.
-        """
-        rows = np.flatnonzero(read_mask("where", where, len(self)))
+    def _values(self, rows: Integers) -> dict[str, Value]:
         found: dict[str, Value] = {}
         for table, members in self.by_structure(rows):
             table.evaluate(None, members)
@@ -420,39 +489,6 @@ class Batch:
         for row in {*fresh[:1].tolist(), *fresh[wrong].tolist()}:
             check_functions(compiled, table.row(row))
         warn_of_start(table.row(int(fresh[0])), stacklevel=6)
-
-    def do(
-        self,
-        request: Mapping[str, Any],
-        *,
-        where: Mask | None = None,
-        space: AnyRegion | None = None,
-        on_refusal: Literal["raise", "skip"] = "raise",
-    ) -> Audits:
-        """Intervene now in all selected worlds; see ``Simulation.do``.
-
-        An intervention is checked once for worlds that are alike, and computed in their rows; see
-        ``RowMemory.ask`` for those that are computed in one world after another. All give the
-        same bits.
-
-        Args:
-            request: Values or interventions by name. A value with a leading axis of n worlds, as
-                such or in a ``Hard``, gives one value to each world; others apply to all.
-            where: Boolean mask of the worlds, shape (n,); all if None.
-            space: Space in which every target must lie.
-            on_refusal: With ``"raise"``, no world changes if one of them refuses. With
-                ``"skip"``, those that refuse are unchanged and are listed in ``refused``.
-
-        Returns:
-            The audits by number of the world.
-
-        Raises:
-            InterventionError: It was refused; the message names the world. Nothing has changed.
-            NotReset: No episode has begun in one of the worlds.
-        """
-        one_of("on_refusal", on_refusal, ("raise", "skip"))
-        rows = np.flatnonzero(read_mask("where", where, len(self)))
-        return self._do(request, rows, space, skips=on_refusal == "skip")
 
     def _do(
         self,
@@ -672,13 +708,6 @@ class Batch:
         self._shown.add(row)
         return self._alone(row)
 
-    def _numbered(self, index: int) -> int:
-        row = whole_number("world", index, least=0)
-        if row >= len(self):
-            allowed = (f"any whole number from 0 to {len(self) - 1}",)
-            raise UnknownOption("world", index, allowed)
-        return row
-
     @typed
     def table(self, index: int) -> Rows:
         """Return the rows of all worlds with the structure of one world."""
@@ -866,12 +895,6 @@ class Batch:
                 tables[kind[0]] = Rows(kind[0], fresh)
             self._tables = {one: table for one, table in tables.items() if table is not None}
         return self._kinds.index(kind)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return the parts for copying and pickling."""

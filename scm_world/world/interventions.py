@@ -362,6 +362,7 @@ class Transaction:
         where: NDArray[np.uint64],
         key: Callable[[int], NoiseKey],
         own: Mapping[str, Any],
+        alone: Callable[[int], Transaction],
     ) -> tuple[Floats, list[int]]:
         """Solve for worlds that differ in their numbers and their noise only.
 
@@ -372,10 +373,10 @@ class Transaction:
             key: Returns the noise key of one of them.
             own: What each has of its own, by target: values, shape (m, *shape), or interventions,
                 shape (m,).
+            alone: Computes what one of them does alone, drawing again where bodies overlap.
 
         Returns:
-            The rows afterwards, shape (m, width), and the places of those that refuse it, or have
-            to draw again.
+            The rows afterwards, shape (m, width), and the places of those that refuse it.
         """
         numbers, acts = bases.numbers.copy(), dict(self.acts)
         drawn, groups = self._boxes
@@ -405,14 +406,17 @@ class Transaction:
                     self.pending[target] = target, act
             self.base = replace(self.base, row=bases.row(place))
             before = replace(self.base, row=now.row(place))
+            done = self
             try:
-                wrong: Any = self.solve(key(place), before) or self.obstacles(before, draws)
+                wrong: Any = self.solve(key(place), before)
+                if not wrong and self.obstacles(before, draws):  # it draws again, or is refused
+                    done = alone(place)
             except ScmWorldError:
                 wrong = True
-            if wrong or (self.change is not None and self.change.structure is not None):
+            if wrong or (done.change is not None and done.change.structure is not None):
                 refused.append(place)
             else:
-                numbers[place] = self.row.numbers
+                numbers[place] = done.row.numbers
         return numbers, refused
 
     def _compute(self, name: str, *, follows: bool) -> None:

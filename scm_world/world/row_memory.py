@@ -56,7 +56,7 @@ class RowMemory:
         groups: The places of the worlds by what changes in them; see ``changes``.
         differs: Whether anything changes in each world, shape (m,).
         states: The states as the engine reported them, if it was given any, shape (m, size).
-        refused: The places of the worlds that have to compute it alone, or refuse it.
+        refused: The places of the worlds that refuse it, or have to compute it alone.
         asked: The requested names.
         model: The causal model below.
         in_force: The interventions of this episode, and on states those of this instant.
@@ -138,6 +138,8 @@ class RowMemory:
             return False
         initial = compiled.random if self.at_start else ()
         first, self.drawn = renewed(first, self._drawn, initial)
+        self._acts = {name: act for name, act in first.items() if name not in values}
+        self._request, self._values, self._space = request, values, space
         base = self._base_of(0)
         done = Transaction(self.structures, base, first, space, self.key(0))
         for name in done.relative:
@@ -158,12 +160,12 @@ class RowMemory:
         kept = {t: one for t, (_, one) in self.in_force.items() if isinstance(one, np.ndarray)}
         there = {*done.order, *done.pending}.difference(targets)
         kept = {t: one for t, one in kept.items() if t in there} | own
-        rows = Rows(compiled, self._base), Rows(compiled, self._before)
-        found, self.refused = done.solve_rows(*rows, self.where, self.key, kept)
+        bases, now = (Rows(compiled, numbers) for numbers in (self._base, self._before))
+        found, self.refused = done.solve_rows(
+            bases, now, self.where, self.key, kept, lambda place: self.done(place)[2]
+        )
         self.numbers, self.asked = found, done.asked
         self.groups, self.differs = changes(compiled, self._before, found)
-        self._request, self._values, self._space = request, values, space
-        self._acts = {name: act for name, act in first.items() if name not in values}
         anew: Named = {}
         for target, (name, act) in done.pending.items():
             if target not in targets:

@@ -108,7 +108,7 @@ def same(worlds: Batch, alone: list[World]) -> None:
         if world.base is not None:
             assert one.base.pending == world.base.pending
             assert one.base.drawn == world.base.drawn
-            kept = world.compiled.kept  # the columns that are not computed from others
+            kept = world.base.row.compiled.kept  # the columns that are not computed from others
             found, wanted = (each.base.row.numbers[kept] for each in (one, world))
             np.testing.assert_array_equal(found, wanted)
         assert one.requested.keys() == world.requested.keys()
