@@ -631,7 +631,7 @@ class Fit:
         return suggested(self, known, n, **how)
 
     def counterfactual(
-        self, do: Mapping[str, object], *, at: int = 0, run: int = 0, draws: int = 32, seed: int = 0
+        self, do: Mapping[str, object], *, at: int = 0, run: int = 0, draws: int = 40, seed: int = 0
     ) -> pd.DataFrame:
         """Return the measurements of a recorded run as they would be under an intervention.
 
@@ -639,8 +639,8 @@ class Fit:
         between the start state of a window and the end of the window before come from causes that
         are not modelled. Both are added again, so that no intervention gives the recorded
         measurements. The interval is that of the parameters, which are drawn from
-        the covariance of the fit (from its prior where the recording determines nothing) with
-        their start states.
+        the covariance of the fit (from its prior where the recording determines nothing), and of
+        the start states, which are drawn given these. Ends are quantiles k : (n + 1) of n draws.
 
         Args:
             do: The intervention, without times: parameters from then on, states at that instant,
@@ -671,21 +671,31 @@ class Fit:
         away = rng.multivariate_normal(
             np.zeros(len(self.scaled)), spread, whole_number("draws", draws, least=2)
         )
-        scaled = np.vstack([self.scaled, np.clip(self.scaled + away, *ranges_of(self.targets))])
+        size = np.sqrt(self.degrees / rng.chisquare(self.degrees, (draws, 1)))  # Student's t
+        away = self.scaled + size * away
+        scaled = np.vstack([self.scaled, np.clip(away, *ranges_of(self.targets))])
         windows = windows_of(self.runs, self.window)
         mine = [w for w, one in enumerate(windows) if one.run == run]
+        errors = dict[int, Floats]()  # of start states, given the parameters
+        for w in mine:
+            _, sizes, right = self.found[w].fitted
+            free = size * rng.normal(size=(draws, len(sizes))) * np.sqrt(self.discount) / sizes
+            errors[w] = np.vstack([np.zeros(right.shape[1]), free @ right])
         with Shooting(self.asked, self.measured, self.targets) as shooting:
             shooting.spans, moved = self.spans, shooting.moved
             starts = [
-                [moved(self.starts[w], self.found[w].slopes @ (one - self.scaled)) for w in mine]
-                for one in scaled
+                [
+                    moved(self.starts[w], self.found[w].slopes @ (one - self.scaled) + errors[w][i])
+                    for w in mine
+                ]
+                for i, one in enumerate(scaled)
             ]
             which = [windows[w] for w in mine]
             plain, other = shooting.replay(which, scaled, np.array(starts), do, at)
             plain = aligned(plain, recorded.values, shooting.rotations)
             found = recorded.values + aligned(other, plain, shooting.rotations) - plain
         tails = 0.5 * (1.0 - CONFIDENCE)
-        ends = np.quantile(found[1:], (tails, 1.0 - tails), axis=0)
+        ends = np.quantile(found[1:], (tails, 1.0 - tails), axis=0, method="weibull")
         time = recorded.begin + self.measured.control_dt * recorded.instants
         names = [column.name for column in self.measured.recorded]
         about = {"time": np.tile(time, len(names)), "column": np.repeat(names, len(time))}
