@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
@@ -37,6 +38,7 @@ from scm_world.fit.recordings import (
     columns_of,
     read_recording,
 )
+from scm_world.fit.saving import saved
 from scm_world.fit.shooting import Shooting
 from scm_world.fit.targets import (
     FAR,
@@ -450,6 +452,22 @@ class Fit:
             how = Reading(None, columns, ignore)
             return predicted(self, read_recording(twin, recording, how), ahead)
 
+    def save(self, path: str | Path) -> None:
+        """Write the fit to a file, as its ending says.
+
+        ``.xml`` and ``.urdf`` are the file that the world was made from, with the fitted numbers;
+        all else of it stays, comments too. It is read again before it is written, and all
+        parameters are compared. A delay is no part of it. ``.yaml`` has the values with their
+        intervals, the remarks and the replay. ``.html`` is a page with tables and
+        traces.
+
+        Raises:
+            UnknownOption: The file has another ending.
+            ModelError: The world was not made from a file, or a parameter is defined elsewhere than
+                in its own element, so that it cannot be written there; nothing is written.
+        """
+        saved(self, Path(path))
+
     @cached_property
     def held_out(self) -> Prediction | None:
         """The prediction of the rows that were held out, if there are such rows."""
@@ -609,7 +627,7 @@ class Fit:
         longest = max(len(run.commands) for run in self.runs)
         count = longest if steps is None else steps
         known = self.sensitivities / np.sqrt(self.discount)
-        how: Any = {"steps": count, "limits": limits, "seed": seed, "setups": setups}
+        how: dict[str, Any] = {"steps": count, "limits": limits, "seed": seed, "setups": setups}
         return suggested(self, known, n, **how)
 
     def counterfactual(
