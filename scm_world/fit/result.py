@@ -642,7 +642,7 @@ class Fit:
         longest = max(len(run.commands) for run in self.runs)
         count = longest if steps is None else steps
         known = self.sensitivities / np.sqrt(self.discount)
-        how: Any = {"steps": count, "limits": limits, "seed": seed, "setups": setups}
+        how: dict[str, Any] = {"steps": count, "limits": limits, "seed": seed, "setups": setups}
         return suggested(self, known, n, **how)
 
     def counterfactual(
