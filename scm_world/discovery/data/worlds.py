@@ -240,7 +240,8 @@ class EpisodeRows:
         names = tuple(name for name in self._watched if name in written)
         whole = self._every_step or not {o.how for o in self._read} <= {"final", "first", "change"}
         ends = not (self._pure or whole) and world.compiled.decided.isdisjoint(names)
-        cases, how = [*self._design.cases(seed, numbers)], {"ends": ends, "listens": self._contacts}
+        how: Any = {"ends": ends, "listens": self._contacts}
+        cases = [*self._design.cases(seed, numbers)]
         kinds: dict[int, tuple[Unit, list[Regime]]] = {}
         for *_, regime in cases:
             if id(regime) not in kinds:
