@@ -19,22 +19,23 @@ from scm_world import variables
 from scm_world.backends.mujoco.backend import MujocoBackend
 from scm_world.backends.mujoco.realization import Realization
 from scm_world.cli.app import app
-from scm_world.env import Check, vector_env
+from scm_world.env import Check, Checkable, vector_env
 from scm_world.env.answers import QUESTIONS
 from scm_world.env.checks import check
+from scm_world.env.ours import OurWorlds
 from scm_world.errors import ScmWorldError, UnknownOption
 
 MASS = {"mass": (0.5, 2.0)}
 
 
-class Pendulums:
+class Pendulums(Checkable):
     """Tensors of n pendulums, which a learner writes for itself: states and parameters by row."""
 
     n_actions = 1
 
     def __init__(self, n: int = 3) -> None:
         self.num_envs = n
-        self.values = {name: np.ones(n) for name in ("mass", "damping")}
+        self.values = {name: np.ones(n) for name in ("mass", "damping", "length")}
         self.state, self.rngs = np.zeros((n, 2)), [np.random.default_rng(i) for i in range(n)]
 
     def get(self, name: str) -> Any:
@@ -56,7 +57,9 @@ class Pendulums:
         angle, speed = self.state.T
         torque = actions[:, 0] - self.values["damping"] * speed
         noise = np.array([rng.normal() for rng in self.rngs])
-        speed = speed + 0.05 * (torque / self.values["mass"] - 9.81 * np.sin(angle) + noise)
+        speed = speed + 0.05 * (
+            torque / self.values["mass"] - 9.81 * np.sin(angle) / self.values["length"] + noise
+        )
         self.state = np.stack([angle + 0.05 * speed, speed], axis=1)
 
     def observe(self) -> Any:
@@ -205,6 +208,11 @@ class UndoLeavesSomething(Pendulums):
         self.values["mass"] = kept
 
 
+FAULTY = (NotWritten, OnNeighbours, Accumulates, AccumulatesInside, Later, LaterUnseen, Clips)
+"""In these, each parameter has the fault."""
+
+
+@pytest.mark.parametrize("n", [2, 3, 7])
 @pytest.mark.parametrize(
     ("made", "question"),
     [
@@ -222,10 +230,14 @@ class UndoLeavesSomething(Pendulums):
         (UndoLeavesSomething, "undo"),
     ],
 )
-def test_a_planted_fault_of_tensors_is_found(made: type[Pendulums], question: str) -> None:
-    """Each planted fault is the answer to its question."""
-    found = check(made(), MASS)
-    assert question in {asked for _, asked, _ in found.faults}, str(found)
+def test_a_planted_fault_of_tensors_is_found(made: type[Pendulums], question: str, n: int) -> None:
+    """Each planted fault is the answer to its question, whatever else is asked in the same runs."""
+    alone = check(made(n), MASS)
+    assert question in {asked for _, asked, _ in alone.faults}, str(alone)
+    beside = check(made(n), {"damping": (0.1, 1.0), **MASS, "length": (0.5, 2.0)})
+    assert question in {asked for name, asked, _ in beside.faults if name == "mass"}, str(beside)
+    if made not in (*FAULTY, ResetsDisturb):
+        assert {*beside.faults} == {*alone.faults}
 
 
 class Draws(Pendulums):
@@ -365,6 +377,18 @@ def test_friction_of_a_box_that_rests_is_not_asked() -> None:
     assert not found.faults, str(found)
     assert found.ranges[0].answers["applied"].status == "passed"
     assert found.ranges[0].answers["responds"].status == "not asked"
+
+
+@pytest.mark.slow
+def test_what_acts_in_another_context_alone_is_a_fault_of_who_declares_it() -> None:
+    """The noise of a random wall lays no regular one: a usual range is not asked about it."""
+    with closing(sw.World("stacked_blocks", num_worlds=2)) as worlds:
+        declared = check(worlds, {"wall_noise": sw.Draw("A")}, steps=1)
+        ours = OurWorlds(worlds)
+        ours.declared(None)
+        assert ours.idle("wall_noise", ran=True).endswith("changes here: wall.layout")
+        assert not ours.idle("stack_levels", ran=True)
+    assert [question for _, question, _ in declared.faults] == ["responds"]
 
 
 def test_actions_are_no_ranges() -> None:
@@ -795,7 +819,7 @@ def test_a_report_is_read_back() -> None:
         (Pendulums, MASS),
         (Pendulums(), None),
         (Pendulums(), {}),
-        (Pendulums(), {"length": (0.0, 1.0)}),
+        (Pendulums(), {"lenght": (0.0, 1.0)}),
         (Pendulums(), {"mass": (1.0,)}),
         (Pendulums(), {"mass": (2.0, 1.0)}),
         (Pendulums(), {"mass": (1.0, 1.0)}),
@@ -828,16 +852,22 @@ def test_a_variable_that_does_not_exist_is_a_typed_error() -> None:
 def test_what_cannot_be_set_is_not_asked() -> None:
     """Without ``set`` no run is paired, and no such question counts as passed."""
 
-    class Drawn(Pendulums):
-        def reset(self, seed: int, mask: Any) -> None:
-            super().reset(seed, mask)
-            for row in np.flatnonzero(mask):
-                self.values["mass"][row] = self.rngs[row].uniform(0.5, 2.0)
+    class Drawn(Checkable):
+        num_envs, n_actions, inside = 3, 1, Draws()
 
-    made: Any = Drawn()
-    public = ("num_envs", "n_actions", "get", "reset", "step", "observe")
-    envs = type("Envs", (), {name: getattr(made, name) for name in public})()
-    assert not hasattr(envs, "set")
+        def get(self, name: str) -> Any:
+            return self.inside.get(name)
+
+        def reset(self, seed: int, mask: Any) -> None:
+            self.inside.reset(seed, mask)
+
+        def step(self, actions: Any) -> None:
+            self.inside.step(actions)
+
+        def observe(self) -> Any:
+            return self.inside.observe()
+
+    envs = Drawn()
     found = check(envs, MASS).ranges[0].answers
     passed = {question for question, answer in found.items() if answer.status == "passed"}
     assert passed == {"applied", "in range", "second reset", "partial reset"}

@@ -41,7 +41,7 @@ from scm_world import (
     variables,
 )
 from scm_world import env as environments
-from scm_world.discovery import benchmarks, data, learners, problems, representations
+from scm_world.discovery import data, learners, problems, representations
 from scm_world.errors import ModelError, ScmWorldError
 from scm_world.policies import planning
 from scm_world.queries.local import local_graph
@@ -333,6 +333,7 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
         "package": "", "doc": "", "baseline": False, "marked": False,
     }  # fmt: skip
     yield discovery.collect, {"source": model, "design": design, "n": 2, "seed": 0, **store}
+    yield data.collect_parts, {"source": model, "design": design, "n": 2, "seed": 0, **store}
     yield (
         discovery.sweep,
         {"system": model, "over": {"a": [0.0]}, "outcomes": ["y"], "n": 2, **store},
@@ -490,19 +491,6 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
     yield sw.load_hull, {"path": folder / "none.obj", "scale": 1.0}
 
 
-class _Here:
-    """Does the jobs of a benchmark in this process."""
-
-    def __init__(self, work: Callable[..., Any]) -> None:
-        self._work = work
-
-    def ask(self, *job: Any, timeout: float | None = None) -> Any:
-        return self._work(*job)
-
-    def close(self) -> None:
-        pass
-
-
 class _TooSlow(BaseException):
     """A call that went on for too long."""
 
@@ -560,11 +548,11 @@ def _only_keeps(one: Any) -> bool:
     return not inspect.signature(one).parameters
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_wrong_arguments_end_in_typed_errors(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each call with one wrong argument ends, in a result or one of our errors."""
-    monkeypatch.setattr(benchmarks, "Worker", _Here)
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")  # a text may be the name of a file to write
     faults, called = [], set()

@@ -9,6 +9,8 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
+import numpy as np
+
 from scm_world._arguments import enter, one_of, typed
 from scm_world.backends.base import (
     ROUNDING,
@@ -28,7 +30,7 @@ from scm_world.errors import (
     ScmWorldError,
     UnknownOption,
 )
-from scm_world.models import Model
+from scm_world.models import Model, Structure
 
 _CLASSES = {
     "mujoco": ("MujocoBackend", "mujoco>=3.17,<5"),
@@ -113,7 +115,7 @@ def make_backend(name: str) -> Backend:
     class_name, requirement = _CLASSES[name]
     try:
         module = importlib.import_module(f"scm_world.backends.{name}")
-        found: Any = getattr(module, class_name)
+        found = getattr(module, class_name)
     except MissingEngine:
         raise
     except ImportError as error:
@@ -143,7 +145,7 @@ def require_exact(
     question: str,
     takes: Callable[[Backend], object],
     *,
-    independent: bool = False,
+    independent: Structure | None = None,
 ) -> None:
     """Refuse a question that compares equal runs bit for bit, if the engine is not exact.
 
@@ -151,15 +153,18 @@ def require_exact(
         backend: The backend that is asked.
         question: What was asked.
         takes: Raises an error for a new backend that cannot be used instead.
-        independent: Whether what does not follow from a change must stay as it is, too.
+        independent: The structure, if what does not follow from a change must stay as it is, too.
 
     Raises:
         InexactEngine: It names the backends that can answer.
     """
 
     def apart(of: Backend) -> float:
-        able = of.capabilities
-        return able.floor or (able.rounding if independent and able.rounding > ROUNDING else 0.0)
+        floor, rounding = of.capabilities.floor, of.capabilities.rounding
+        if floor or independent is None:
+            return floor
+        size = float(np.max(rounding(of, independent, 1)))
+        return size if size > ROUNDING else 0.0
 
     floor = apart(backend)
     if not floor:

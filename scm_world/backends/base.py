@@ -7,6 +7,7 @@ A backend holds one scene. It knows bodies, parameters and states, and nothing a
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, TypeVar, final
@@ -64,9 +65,10 @@ class Capabilities:
         physics: Whether anything moves by itself.
         floor: How far apart the states of two equal runs may be, in their units; 0 if the engine
             is exact: equal runs are equal bit for bit.
-        rounding: Smaller changes of a state in a control step, by the larger of its value and one
-            unit, are no effects: the engine rounds, or solves for bodies together that do not
-            touch.
+        rounding: Given a backend, a structure and the number of physics steps in a control step,
+            the changes of a state in such a step that are no effects, by the larger of the value
+            and one unit, of all numbers of the state or of each: the engine rounds, or solves for
+            bodies together that do not touch.
         scenes: How many scenes the engine steps best in one call, where that does not follow from
             the number of its threads: of a GPU, thousands.
         supports: Whether the engine realises a parameter of a structure.
@@ -76,7 +78,7 @@ class Capabilities:
 
     physics: bool = True
     floor: float = 0.0
-    rounding: float = ROUNDING
+    rounding: Callable[[Any, Structure, int], Floats | float] = lambda *_: ROUNDING
     scenes: int | None = None
     supports: Callable[[Structure, ParameterKey], bool] = lambda structure, key: True
     remarks: Callable[[Any, Parameters], tuple[str, ...]] = lambda backend, before: ()
@@ -125,9 +127,11 @@ class Scenes(ABC):
     Attributes:
         may_refuse: Whether a scene whose step fails can be as it was; if not, it has lost its
             state.
+        stays: Whether states may stay on a device; see ``resident``.
     """
 
     may_refuse: ClassVar[bool] = True
+    stays: ClassVar[bool] = False
 
     @abstractmethod
     def __init__(self, n: int, threads: int) -> None: ...
@@ -230,6 +234,21 @@ class Scenes(ABC):
 
     def tensor(self, which: Integers, name: str) -> Any:
         """Return a state of some scenes where the engine has it; see ``Backend.tensor``."""
+        raise EngineFailure(NO_DEVICE, getattr(self, "name", type(self).__name__))
+
+    def resident(self, which: Integers, copies: Counter[str]) -> Any:
+        """Let the states of scenes stay where the engine has them from step to step.
+
+        Args:
+            which: The scenes, all that there are.
+            copies: Counts the bytes that are copied between host and device, by reason.
+
+        Returns:
+            What steps them there; see ``scm_world.backends.warp.resident.Resident``.
+
+        Raises:
+            EngineFailure: The engine has no states on a device, or not these together.
+        """
         raise EngineFailure(NO_DEVICE, getattr(self, "name", type(self).__name__))
 
     @abstractmethod
@@ -566,7 +585,8 @@ class BackendWrapper(Backend, ABC):
     """
 
     capabilities: ClassVar[Capabilities] = Capabilities(
-        remarks=lambda self, before: self.engine.capabilities.remarks(self.engine, before)
+        rounding=lambda self, *of: self.engine.capabilities.rounding(self.engine, *of),
+        remarks=lambda self, before: self.engine.capabilities.remarks(self.engine, before),
     )
 
     @typed

@@ -21,7 +21,7 @@ class FakeBackend(InMemory):
     """
 
     name: ClassVar[str] = "fake"
-    capabilities: ClassVar[Capabilities] = Capabilities(physics=False)
+    capabilities: ClassVar[Capabilities] = Capabilities(physics=False, scenes=512)
 
     def step(self, command: Floats, substeps: int) -> None:
         """Advance time."""

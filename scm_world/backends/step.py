@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal, final
 import numpy as np
 
 from scm_world._fingerprint import digest, fingerprint
-from scm_world._types import Floats, Integers, Value
+from scm_world._types import ArrayLike, Floats, Integers, Value
 from scm_world.backends.base import InMemory, Scenes, SeparateScenes
 from scm_world.errors import EngineFailure, ModelError
 from scm_world.models.model import Numbers, Readout
@@ -187,7 +187,7 @@ class StepModel(Structure):
                     raise self._failure(changed)
         return result
 
-    def _failure(self, what: str, **data: Any) -> EngineFailure:
+    def _failure(self, what: str, **data: object) -> EngineFailure:
         return EngineFailure(f"the step function of {self.name!r} {what}", "step", **data)
 
     def _named(self, kind: str, numbers: Floats) -> dict[str, Any]:
@@ -207,7 +207,7 @@ class StepModel(Structure):
             found[quantity.name] = part
         return found
 
-    def _checked(self, result: Any, lead: tuple[int, ...]) -> Floats:
+    def _checked(self, result: ArrayLike, lead: tuple[int, ...]) -> Floats:
         """Put what the function gave into an array, shape (*lead, s), or refuse it."""
         places, problems = self.layout.slices, list[str]()
         new = np.empty((*lead, self.layout.size))

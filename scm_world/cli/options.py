@@ -63,7 +63,7 @@ HELP = {
     "nature": "Context distribution: variation between episodes, such as gravity=draw:A.",
     "outcome": "Outcome, such as reward or sum:reward.",
     "out": "Folder for the results, or a URL such as s3://bucket/run.",
-    "shard": "Episodes in one file; of worlds 100, or as many as the engine steps best together.",
+    "shard": "Episodes in one file; of worlds 500, or as many as the engine steps best together.",
     "size": "Height and width of a picture in pixels.",
     "croissant": "Write README.md and croissant.json, too, by which Hugging Face and mlcroissant "
     "find the Parquet files.",

@@ -343,7 +343,7 @@ def _pictures(found: Consequences) -> dict[str, bytes]:
 def check(
     source: Annotated[str, typer.Argument(metavar="SYSTEM")],
     *,
-    worlds: options.Count = 4,
+    worlds: options.Count = 8,
     ranges: Path | None = None,
     by: Annotated[Literal["set", "reset"] | None, typer.Option(show_default="see sw.check")] = None,
     steps: options.Count = 25,
@@ -507,6 +507,8 @@ def fit(
     noise: options.Pairs = None,
     window: options.NotNegative = 0,
     begins: Annotated[list[str] | None, typer.Option(metavar="rest|NAME=VALUE,SD")] = None,
+    column: Annotated[list[str] | None, typer.Option(metavar="COLUMN=NAME")] = None,
+    ignore: options.Words = None,
     setup: Annotated[list[str] | None, typer.Option(metavar="NUMBER:NAME=VALUE")] = None,
     symmetric: bool = False,
     held_out: options.Amount = 0.0,
@@ -517,6 +519,7 @@ def fit(
     do: options.Pairs = None,
     at: options.NotNegative = 0,
     run: options.NotNegative = 0,
+    save: list[Path] | None = None,
     asked: options.Asked,
 ) -> None:
     """Fit parameters of a world to recordings: tables of time, commands and measurements.
@@ -526,14 +529,16 @@ def fit(
     Example: scm-world fit arm.xml run.csv --parameters "*.damping" --noise elbow.position=0.001
 
     Args:
-        recordings: CSV, Parquet or npz files with the time in seconds, every command, and any
-            states or readouts; they are fitted together.
+        recordings: Tables of text (with commas, semicolons or tabs), Parquet or npz files with the
+            time in seconds, every command, and any states or readouts; they are fitted together.
         parameters: Fitted parameter, such as '*.damping', upper_arm.mass or delay.
         noise: Standard deviation of a measurement; estimated by default.
         window: Rows of a window, which begins in a fitted state; 0 for 50, or 10 where only these
             explain the recording.
         begins: How the recordings begin: 'rest', or a state with its standard deviation, such as
             '*.velocity=0,0.01'; fitted by default.
+        column: Name of this system for a column of the files, such as torque=motor.control.
+        ignore: Columns that are left out, such as 'temperature*'.
         setup: Value of a parameter that was set for a recording, such as 1:weight.mass=1.0; the
             first recording has the number 0.
         symmetric: Whether fitted ranges [-a, a] stay symmetric.
@@ -546,6 +551,8 @@ def fit(
         do: Intervention on a recorded run: its counterfactual measurements are written.
         at: Control step of this intervention.
         run: Number of this run.
+        save: File with the fitted values: .xml or .urdf (that of the system, with other numbers),
+            .yaml, or .html (a page).
     """
     known, size = parse_assignments(noise, "'--noise'") or None, window or None
     ranges, request = parse_assignments(limits, "'--limits'"), parse_assignments(do, "'--do'")
@@ -555,6 +562,9 @@ def fit(
     with asked.open(name, task) as (system, folder, engine), console.progress("fits") as tell:
         began = "rest" if begins == ["rest"] else parse_assignments(begins, "'--begins'") or None
         given: dict[str, Any] = {"noise": known, "window": size, "begins": began, "progress": tell}
+        texts = parse_assignments(column, "'--column'", lambda text, hint: text)
+        names: dict[str, Any] = {"columns": texts, "ignore": ignore or ()}
+        given |= names
         given["setups"] = _setups(setup, len(recordings)) if setup else None
         shown: sw.Fit | sw.Deviation
         if parameters:
@@ -562,10 +572,13 @@ def fit(
             found = shown = system.fit(recordings, parameters, **given)
             combinations = found.identifiable.drop(columns="parameters")
             frames = {"fit": found.table, "identifiable": combinations}
+        elif held_out or symmetric:
+            asks = "--held-out" if held_out else "--symmetric"
+            raise UnknownOption(asks, "given", ("left out, where no --parameters are named",))
         else:
             shown = deviation = system.explain(recordings, **given)
             found, frames = deviation.fit, {"explanation": deviation.table}
-        predictions = {other: found.predict(other) for other in predict or ()}
+        predictions = {other: found.predict(other, **names) for other in predict or ()}
         other = found.counterfactual(request, at=at, run=run, seed=asked.seed) if request else None
         try:
             if suggest:
@@ -601,6 +614,9 @@ def fit(
     )
     files = {f"{name}.csv": table.to_csv(index=False) for name, table in tables.items()}
     console.write(folder, {**files, "fit.png": png(found.picture()), "result.json": result})
+    for path in save or ():
+        found.save(path)
+        console.say(f"written: {path}")
     if failed is not None:
         raise failed
     raise typer.Exit(int(not found.explains))

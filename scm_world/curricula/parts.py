@@ -62,7 +62,7 @@ def own(act: object, situation: Situation) -> Any:
     return act.redrawn("", streamed) if isinstance(act, Intervention) else act
 
 
-def _request(given: Any) -> Mapping[str, object]:
+def _request(given: Mapping[str, object] | None) -> Mapping[str, object]:
     """Return interventions by dotted name; those of a file stay plain data."""
     acts = {
         name: value if isinstance(value, list | tuple) else [value]

@@ -3,7 +3,7 @@
 import gymnasium
 
 from scm_world._types import Observation
-from scm_world.env.answers import Checkable
+from scm_world.backends.checkable import Checkable
 from scm_world.env.batch import ScmWorldVectorEnv
 from scm_world.env.checks import Check, check
 from scm_world.env.environment import ENV_OPTIONS, ScmWorldEnv

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Callable
 from typing import Any, final
 
 import gymnasium
@@ -70,6 +72,7 @@ class Actions:
             several = gymnasium.spaces.MultiDiscrete(counts)
             self.space = gymnasium.spaces.Discrete(int(counts[0])) if low.size == 1 else several
         self.reads: str | None = None
+        self._gain, self._reach = 1.0, (self._high - self._low) / 2.0
         mode = world.options.action_mode
         if relative and self._is_choice:
             raise UnknownOption("action_mode", PREFIX + mode, (f"{mode}, of what is counted",))
@@ -85,8 +88,10 @@ class Actions:
         one_of("delta_origin", origin, (COMMAND, MEASURED))
         # Normalized actions fill [-1, 1] at every scale; others keep their unit.
         normalized = bool(np.any(self._half != 1.0) or np.any(self._middle != 0.0))
-        reach = (self._high - self._low) / 2.0
-        self._gain, self._reach = (scale, reach) if normalized else (1.0, scale * reach)
+        if normalized:
+            self._gain = scale
+        else:
+            self._reach = scale * self._reach
         self.space = box(-self._reach, self._reach)
         self.reads = TIPS if mode == TIPS else None if origin == COMMAND else mode
         if self.reads not in (None, TIPS, JOINTS):
@@ -149,9 +154,16 @@ class Actions:
 
     def moved(self, action: Floats, offset: Floats) -> Floats:
         """Add the origin of relative actions, shape (..., n) [SI units]; clip to the range."""
-        step = self._gain * np.clip(action, -self._reach, self._reach)
+        step = self._gain * action.clip(-self._reach, self._reach)
         relative = (offset - self._middle) / self._half
-        return np.clip(step + relative, self._low, self._high)
+        return (step + relative).clip(self._low, self._high)
+
+    def with_arrays(self, made: Callable[[Floats], Any]) -> Any:
+        """Return the same with arrays of another library, for ``moved`` and ``scale``."""
+        other = copy.copy(self)
+        for name in ("_middle", "_half", "_low", "_high", "_reach", "scale"):
+            setattr(other, name, made(getattr(self, name)))
+        return other
 
     def offset(self) -> Floats:
         """Return the present origin of relative actions, shape (n,) [SI units]."""

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Mapping
-from typing import Any, Literal, Protocol, final, runtime_checkable
+from typing import Any, Literal, final
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from scm_world._types import ArrayLike, Floats, Mask
+from scm_world._types import ArrayLike, Floats
 from scm_world.variables.distributions import Distribution
 from scm_world.world.simulation import READ_BACK
 
@@ -29,42 +28,6 @@ QUESTIONS: Mapping[str, str] = {
 TARGETS = (1.0 - 1e-12, 0.0, 0.75, 0.25, 0.5, 0.9, 0.1)  # places in a range, tried in this order
 ROUNDING = 1e-9  # share of the spread of a number that an effect in rounding has
 Status = Literal["passed", "fault", "not asked"]
-
-
-@runtime_checkable
-class Checkable(Protocol):
-    """What ``check`` asks of many environments: four methods and two numbers.
-
-    Masks have shape (n,), bool. Actions lie in [-1, 1], shape (n, n_actions). There may be more:
-    ``set(name, values, mask)`` writes values of shape (n, …) in the worlds of a mask, now;
-    ``reference(name)``: values without randomisation, shape (n, …); ``columns()``: name and unit
-    of each number of ``observe``; ``unit(name)``; ``stale(name)``: derived constants that are not
-    those of a fresh compilation, each with its relative difference; ``refresh()``: derives them
-    anew, and returns a function that undoes this. A question that needs a missing one is not asked.
-
-    Attributes:
-        num_envs: Number of worlds n.
-        n_actions: Number of actions.
-    """
-
-    num_envs: int
-    n_actions: int
-
-    @abstractmethod
-    def get(self, name: str) -> ArrayLike:
-        """Read a parameter in the engine of each world, shape (n, …)."""
-
-    @abstractmethod
-    def reset(self, seed: int, mask: Mask) -> object:
-        """Begin episodes in the worlds of a mask; world i has the seed ``seed + i``."""
-
-    @abstractmethod
-    def step(self, actions: Floats) -> ArrayLike | None:
-        """Advance all worlds; return which ended an episode, shape (n,), or None."""
-
-    @abstractmethod
-    def observe(self) -> ArrayLike:
-        """Return the states of all worlds, shape (n, k)."""
 
 
 @final

@@ -1,9 +1,14 @@
-"""The questions of ``check``, and how they are answered."""
+"""The questions of ``check``, and how they are answered.
+
+Values are set in several worlds of a run at once, those of one range in each. Where anything of
+this is not as it should be, each of these ranges is asked alone, and the answer says what it is.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple, final, get_args
@@ -12,6 +17,7 @@ import numpy as np
 
 from scm_world._arguments import finite_numbers
 from scm_world._types import Floats, Mask
+from scm_world.backends.checkable import Checkable
 from scm_world.env.answers import (
     ROUNDING,
     TARGETS,
@@ -35,6 +41,7 @@ SPACES: Any = get_args(get_args(Space)[0])
 NEAR = 0.05  # share of a range: a value nearer than this is not another one
 UNDONE = 1e-6  # share of an effect that an undo may leave: rounding
 OTHER = 1_000  # offset of the seed of a partial reset
+MOST = 3  # values of a range to which a state may not respond: then it does not
 
 
 class PairedRun(NamedTuple):
@@ -53,35 +60,72 @@ class Response(NamedTuple):
     step: int = 0
 
 
+@dataclass(eq=False)
+class Asked:
+    """A range that is asked about, in one world.
+
+    Attributes:
+        name: The parameter.
+        space: Its values.
+        alone: Whether no other range is asked about in the same runs.
+        attempt: How many values the state did not respond to.
+        world: Number of the world.
+        before: Values without a change, shape (n, …).
+        values: The same with the value that is tried in its world.
+        at: The place of this value in the range, from 0 to 1.
+        seen: Values before and after each setting, both of shape (n, …).
+        later: The value of its world after the next reset.
+        late: Whether the state responds only then.
+        stuck: Why the old value is refused, or nothing.
+        gap: The response.
+    """
+
+    name: str
+    space: Distribution
+    alone: bool = False
+    attempt: int = 0
+    world: int = 0
+    before: Floats = field(default_factory=lambda: np.empty(0))
+    values: Floats = field(default_factory=lambda: np.empty(0))
+    at: float = 0.0
+    seen: list[tuple[Floats, Floats]] = field(default_factory=list)
+    later: Floats = field(default_factory=lambda: np.empty(0))
+    late: bool = False
+    stuck: str = ""
+    gap: Response | None = None
+
+
 @final
 class Asking:
-    """Asks worlds all questions about one range after another."""
+    """Asks worlds all questions."""
 
-    def __init__(self, worlds: Any, seed: int, steps: int, resets: int) -> None:
+    def __init__(self, worlds: Checkable, seed: int, steps: int, resets: int) -> None:
         self.worlds, self.seed, self.resets, self.n = worlds, seed, resets, worlds.num_envs
-        self.all, self.only = np.ones(self.n, bool), np.arange(self.n) == 0
+        self.all = np.ones(self.n, bool)
         rng = np.random.default_rng(seed)
-        self.actions = rng.uniform(-1.0, 1.0, (steps, self.n, worlds.n_actions))
-        self.can_set, self.floor = hasattr(worlds, "set"), 0.0
+        self.actions = rng.uniform(-1.0, 1.0, (steps * worlds.steps, self.n, worlds.n_actions))
+        self.can_set, self.floor = type(worlds).set is not Checkable.set, 0.0
         self.limit = self.spread = np.ones(0)  # of each number of a state
-        if not getattr(worlds, "has_steps", True):
-            self.actions = self.actions[:0]
+        self.columns: list[tuple[str, str]] = []  # name and unit of each of them
+        self.owners = np.empty(0, dtype=object)  # name of the variable of each of them
+        self.coupling = np.zeros(0)  # what is no response after a step, by values or one
         self.names: tuple[str, ...] = ()
-        self.declared = True
+        self._base: PairedRun | None = None  # a run without a change
+        self._turn = 0
+        self._changed: list[str] = []  # names of values that a reset of another world changed
 
     def spaces(self, given: Mapping[str, Any] | None) -> dict[str, Distribution]:
         """Return the declared ranges as spaces; all values are read once."""
         self.worlds.reset(self.seed, self.all)
-        self.declared = given is not None or hasattr(self.worlds, "named")
-        expanded = getattr(self.worlds, "usual", dict)() if given is None else given
-        if hasattr(self.worlds, "named"):
-            expanded = self.worlds.named(expanded)
+        expanded = self.worlds.declared(given)
         if not expanded:
             raise UnknownOption(
                 "ranges", given, ("a range for each name: there are no usual ones",)
             )
         found = {name: self._space(name, one) for name, one in expanded.items()}
-        self.names = tuple(found)
+        self.names, self.columns = tuple(found), self.worlds.columns()
+        self.coupling = np.broadcast_to(self.worlds.rounding(), (len(self.columns),))
+        self.owners = np.array([column.partition("[")[0] for column, _ in self.columns])
         return found
 
     def _space(self, name: str, given: Any) -> Distribution:
@@ -97,9 +141,8 @@ class Asking:
             raise UnknownOption("shape of " + name, now.shape, (f"({self.n}, …), a row a world",))
         relative = isinstance(given, Scale | Shift)
         ends = given.by if relative else given
-        if isinstance(ends, Draw):
-            ends = self.worlds.space(name, ends) if hasattr(self.worlds, "space") else ends.source
-        if isinstance(ends, SPACES) and not (relative and isinstance(ends, Box)):
+        ends = ends.source if isinstance(ends, Draw) else ends
+        if isinstance(ends, SPACES) and not relative:
             space: Distribution = ends
             return space
         if isinstance(ends, Box):
@@ -111,27 +154,21 @@ class Asking:
             raise UnknownOption(f"range of {name}", given, (*allowed, "Scale(Draw(0.5, 1.5))"))
         low, high = (np.broadcast_to(end, shape) for end in pair)  # type: ignore[arg-type] # checked
         if relative:
-            base = self._reference(name, now)[0]
+            base = np.asarray(self.worlds.reference(name), dtype=np.float64)[0]
             low, high = ((base * e if isinstance(given, Scale) else base + e) for e in (low, high))
             low, high = np.minimum(low, high), np.maximum(low, high)
         if (low > high).any() or not (low < high).any():
             raise UnknownOption(f"range of {name}", given, ("one in which low is below high",))
         return Box(*(end.ravel().tolist() if shape else float(end) for end in (low, high)))
 
-    def _reference(self, name: str, now: Floats) -> Floats:
-        given = getattr(self.worlds, "reference", None)
-        return now if given is None else np.array(given(name), dtype=np.float64)
+    def value(self, one: Asked, u: float) -> Floats:
+        """Return the value at a place in a range, from 0 to 1, given the values of its world."""
+        values = self.worlds.values(one.world) if one.space.parents() else {}
+        return at(one.space, u, self.read(one.name).shape[1:], values)
 
-    def value(self, space: Distribution, name: str, u: float) -> Floats:
-        """Return the value at a place in a range, from 0 to 1, given the values of world 0."""
-        shape = self.read(name).shape[1:]
-        values = self.worlds.values() if space.parents() else {}
-        return at(space, u, shape, values)
-
-    def unit(self, name: str) -> str:
-        """Return the unit of a parameter."""
-        given = getattr(self.worlds, "unit", None)
-        return "" if given is None else str(given(name))
+    def ends(self, one: Asked) -> tuple[Floats, Floats]:
+        """Return both ends of a range."""
+        return self.value(one, 0.0), self.value(one, TARGETS[0])
 
     # --- runs ---------------------------------------------------------------------------------
 
@@ -143,14 +180,29 @@ class Asking:
         """Set a parameter in some worlds; all have a value in ``values``."""
         self.worlds.set(name, values, self.all if mask is None else mask)
 
+    def only(self, one: Asked) -> Mask:
+        """Return the mask of the world of a range."""
+        return np.asarray(np.arange(self.n) == one.world)
+
     def run(
-        self, first: Callable[[], object] = int, middle: Callable[[], object] = int
+        self,
+        first: Callable[[], object] = int,
+        middle: Callable[[], object] = int,
+        until: Callable[[int, Floats], bool] = lambda step, states: False,
     ) -> PairedRun:
-        """Run equal episodes, with calls after their reset and in the middle of them."""
+        """Run equal episodes.
+
+        Args:
+            first: Called after their reset.
+            middle: Called in the middle of them.
+            until: Whether a run may end at a step with such states.
+        """
         self.worlds.reset(self.seed, self.all)
         first()
         states, alive = [self._observed()], [self.all]
         for step, actions in enumerate(self.actions):
+            if until(step, states[-1]):
+                break
             if step == len(self.actions) // 2:
                 middle()
             ended = self.worlds.step(actions)
@@ -167,6 +219,7 @@ class Asking:
     def measure(self, first: Callable[[], object] = int) -> None:
         """Run twice without a change: the floor, and the spread of each number of a state."""
         one, other = self.run(first), self.run(first)
+        self._base = one
         kept = one.states[one.alive]
         with np.errstate(invalid="ignore"):
             spread, size = kept.std(axis=0), np.abs(kept).max(axis=0)
@@ -178,9 +231,10 @@ class Asking:
 
     def gap(self, one: PairedRun, other: PairedRun, rows: Mask, name: str = "") -> Response | None:
         """Compare runs in some worlds; None if they are equal. Columns of ``name`` are left out."""
-        far = _far(one.states, other.states)
-        far[~(one.alive & other.alive & rows)] = 0.0
-        far[..., [column.partition("[")[0] == name for column, _ in self.columns]] = 0.0
+        n = min(len(one.states), len(other.states))
+        far = _far(one.states[:n], other.states[:n])
+        far[~(one.alive[:n] & other.alive[:n] & rows)] = 0.0
+        far[..., self.owners == name] = 0.0
         far[far <= self.limit] = 0.0
         if not far.any():
             return None
@@ -190,13 +244,19 @@ class Asking:
         sizes = far.max(axis=(0, 1))
         return Response(float(share.max()), float(sizes[column]), column, step)
 
-    @property
-    def columns(self) -> list[tuple[str, str]]:
-        """Name and unit of each number of a state."""
-        if hasattr(self.worlds, "columns"):
-            given: list[tuple[str, str]] = self.worlds.columns()
-            return given
-        return [(f"observation[{i}]", "") for i in range(self.spread.size)]
+    def response(self, run: PairedRun, base: PairedRun, one: Asked) -> Response | None:
+        """Compare runs in the world of a range.
+
+        Where bodies that do not touch move one another, only the first step can tell.
+        """
+        if not self.coupling.any():
+            return self.gap(run, base, self.only(one), one.name)
+        here, there = (PairedRun(r.states[:2].copy(), r.alive[:2]) for r in (run, base))
+        room = self.coupling * np.maximum(
+            1.0, np.maximum(np.abs(here.states), np.abs(there.states))
+        )
+        np.copyto(here.states, there.states, where=_far(here.states, there.states) <= room)
+        return self.gap(here, there, self.only(one), one.name)
 
     def said(self, gap: Response | None, words: str) -> dict[str, Any]:
         """Return the text and the numbers of a difference in the state."""
@@ -215,255 +275,389 @@ class Asking:
 
     # --- values that are set from outside -----------------------------------------------------
 
-    def set_from_outside(self, name: str, space: Distribution) -> dict[str, Answer]:
-        """Answer all questions by setting a value in world 0.
+    def set_from_outside(
+        self, spaces: Mapping[str, Distribution], tell: Callable[[int], object]
+    ) -> dict[str, dict[str, Answer]]:
+        """Answer all questions by setting values.
 
-        Where nothing that is computed depends on it, by declaration, no steps are needed.
+        Where nothing that is computed depends on them, by declaration, no steps are needed.
+
+        Args:
+            spaces: The ranges.
+            tell: Called with the number of ranges that are answered.
         """
-        if self._still(name) and len(self.actions):
-            actions, self.actions = self.actions, self.actions[:0]
-            try:
-                return self.set_from_outside(name, space)
-            finally:
-                self.actions = actions
-        base, worlds = self.run(), self.worlds
-        worlds.reset(self.seed, self.all)
-        before, values = self.read(name), self.read(name)
-        tried, why = self._accepted(name, space, before)
-        if not tried:
-            return why
-        got: list[Floats] = []
-        act = partial(self._change, name, values, got)
-        late, found = False, dict[str, Answer]()
-        for values[0] in tried:
-            got.clear()
-            one = self.run(act)
-            gap = self.gap(one, base, self.only, name)
-            if gap is None:
-                gap = self.gap(self.run(), base, self.only, name)
-                late = gap is not None
-            if gap is not None:
-                break
-            self._write_back(name, before, self.only)
-        wanted = values[0]
-        worlds.reset(self.seed, self.all)
-        later = self.read(name)
-        if not np.array_equal(got[0][0], before[0]):
-            found["applied"] = Answer(status="passed")
-        elif near(later[0], wanted):
-            late, found["applied"] = True, Answer(status="passed", said="after the next reset")
-        else:
-            said = f"{numbers(wanted)} was set, and the engine still has {numbers(before[0])}"
-            found["applied"] = Answer(status="fault", said=said)
-        found["in range"] = self._taken(name, space, before, late)
-        found |= self._responses(name, gap, late)
-        if gap is not None and not late and found["in range"].status == "passed":
-            found["in range"] = Answer(status="passed", said=self._flat(name, space, before))
-        found["neighbours"] = self._neighbours(one, base, got[0], before)
-        if not (near(later[0], before[0]) or near(later[0], wanted)):
-            said = f"after the next reset it is {numbers(later[0])}"
-            found["second reset"] = Answer(status="fault", said=said)
-        else:
-            found["second reset"] = self._repeated(act, one, got, late)
-        found["partial reset"] = self._partial(one, act)
-        found["undo"] = missing("it acts only after the next reset")
-        if not late:
-            found["undo"] = self._undo(name, values, before, base, gap)
-        found["constants"] = self._constants(name, one, act)
-        worlds.reset(self.seed, self.all)
-        self._write_back(name, before, self.all)
+        found: dict[str, dict[str, Answer]] = {}
+        idle, actions = {n for n in spaces if self.worlds.idle(n, ran=False)}, self.actions
+        for names in (spaces.keys() - idle, idle):
+            if names is idle:
+                self.actions, self._base = actions[:0], None
+            waiting = [Asked(name, space) for name, space in spaces.items() if name in names]
+            while waiting:
+                alone = waiting[0].alone
+                group = waiting[: 1 if alone else max(1, self.n - 1)]
+                group = [one for one in group if one.alone == alone]
+                found |= self._ask(group, tries=1 if names is idle else MOST)
+                waiting = [one for one in waiting if one.name not in found]
+                waiting.sort(key=lambda one: (one.alone, one.attempt))
+                tell(len(found))
         return found
 
-    def _change(
-        self, name: str, values: Floats, got: list[Floats], first: Callable[[], object] = int
-    ) -> None:
-        """Set a value in world 0, after another call; ``got`` receives the values that follow."""
-        first()
-        self.write(name, values, self.only)
-        got.append(self.read(name))
+    def _ask(self, group: list[Asked], tries: int) -> dict[str, dict[str, Answer]]:
+        """Ask about ranges, each in a world of its own. Those without an answer are asked again."""
+        alone, base = len(group) == 1, self._base or self.run()
+        found, last = self._choose(group, tries)
+        asked = [one for one in group if one.name not in found]
+        if not asked:
+            return found
+        first = self.run(partial(self._act, asked))
+        self.worlds.reset(self.seed, self.all)
+        for one in asked:
+            one.gap = self.response(first, base, one)
+            one.later = self.read(one.name)[one.world]
+        quiet = {one for one in asked if one.gap is None and one not in last}
+        loud = [one for one in asked if one not in quiet]
+        # About half of them are set back while the others are set again; then the other way round.
+        # In the middle the last world is reset.
+        self._turn += 1
+        bit = self._turn % max(1, (self.n - 2).bit_length())
+        back = {one for one in loud if one.world >> bit & 1}
+        self._changed = []
+        again = first
+        if loud or not all(one.attempt for one in quiet):  # values act late in the first attempt
+            again = self.run(partial(self._act, loud, back), int if alone else self._reset_last)
+        for one in quiet:
+            one.gap = None if one.attempt else self.response(again, base, one)
+            if one.gap is None:
+                one.attempt += 1
+            elif alone:  # the value is in the engine from now on
+                one.late, loud = True, [one]
+                first, again = (self.run(partial(self._act, loud)) for _ in range(2))
+            else:
+                one.alone = True
+        answers = self._answers(group, loud, back, base, first, again) if loud else {}
+        self._set_back(group)
+        faulty = any(a.status == "fault" for given in answers.values() for a in given.values())
+        self._base = None if faulty else base
+        for one in group:
+            one.alone |= faulty
+        return found | ({} if faulty and not alone else answers)
 
-    def _undo(
-        self, name: str, values: Floats, before: Floats, base: PairedRun, gap: Response | None
-    ) -> Answer:
-        def act() -> None:
-            self.write(name, values, self.only)
-            self.write(name, before, self.only)
+    def _choose(
+        self, group: list[Asked], tries: int
+    ) -> tuple[dict[str, dict[str, Answer]], set[Asked]]:
+        """Choose a value of each range: one that its world takes, and another one each time.
 
-        try:
-            left = self.gap(self.run(act), base, self.all, name)
-        except InterventionError as error:
-            return missing(f"the old value is refused: {error}")
-        if left is not None and gap is not None and left.share <= UNDONE * gap.share:
+        Returned are all answers about ranges without such a value, and those of which no other one
+        is tried.
+        """
+        found: dict[str, dict[str, Answer]] = {}
+        taken, why = dict.fromkeys(group, 0), dict[Asked, str]()
+        self.worlds.reset(self.seed, self.all)
+        for world, one in enumerate(group):
+            one.world, one.before, one.seen = world, self.read(one.name), []
+        for u in TARGETS:
+            looking = [one for one in group if taken[one] <= one.attempt and one.name not in found]
+            for one in looking:
+                (low, high), values, now = self.ends(one), one.before.copy(), one.before[one.world]
+                values[one.world] = self.value(one, u)
+                if near(values[one.world], now, NEAR * np.abs(high - low)):
+                    continue
+                try:
+                    self.write(one.name, values, self.only(one))
+                except InterventionError as error:
+                    why[one] = f"the last one because {error}"
+                except ScmWorldError as error:
+                    fault = Answer(status="fault", said=str(error))
+                    found[one.name] = {**none("it is not applied"), "applied": fault}
+                else:
+                    one.values, one.at, taken[one] = values, u, taken[one] + 1
+            if looking:
+                self._set_back(looking)
+        for one in group:
+            if not taken[one] and one.name not in found:
+                refused = f"every value that was tried was refused, {why.get(one)}"
+                found[one.name] = none(
+                    refused if one in why else "no other value lies in the range"
+                )
+        last = {one for one in group if one.attempt and taken[one] <= one.attempt}
+        return found, last | {one for one in group if one.attempt + 1 >= tries}
+
+    def _act(self, ranges: Iterable[Asked], back: Collection[Asked] = ()) -> None:
+        """Set the value of each range in its world; set some back again."""
+        for one in ranges:
+            before = self.read(one.name)
+            self.write(one.name, one.values, self.only(one))
+            one.seen.append((before, self.read(one.name)))
+            if one in back:
+                try:
+                    self.write(one.name, one.before, self.only(one))
+                except InterventionError as error:
+                    one.stuck = f"the old value is refused: {error}"
+
+    def _set_back(self, ranges: Iterable[Asked]) -> None:
+        """Set the old values, and begin episodes: some worlds take values over only then."""
+        self.worlds.reset(self.seed, self.all)
+        for one in ranges:
+            with suppress(InterventionError):  # of worlds that have it again after a reset
+                self.write(one.name, one.before)
+        self.worlds.reset(self.seed, self.all)
+
+    def _answers(
+        self,
+        group: list[Asked],
+        asked: list[Asked],
+        back: Collection[Asked],
+        base: PairedRun,
+        first: PairedRun,
+        again: PairedRun,
+    ) -> dict[str, dict[str, Answer]]:
+        """Answer all questions about ranges. If several are asked, a fault may be of another one.
+
+        Args:
+            group: All that were set.
+            asked: Those to be answered.
+            back: Those of them that were set back in ``again``.
+            base: A run without a change.
+            first: With it.
+            again: With it again.
+        """
+        alone, act = len(group) == 1, partial(self._act, asked)
+        others = np.arange(self.n) >= len(group)
+        middle: Any = int if alone else self._reset_last
+        late = any(one.late for one in asked)
+        undone = {one for one in asked if one not in back}
+        final = again if late else self.run(partial(self._act, asked, undone), middle)
+        partly = self._partial(first, act) if alone else self._unchanged()
+        taken, flat = self._taken(asked), dict[str, str]()
+        clear = [one for one in asked if one.gap and taken[one].status == "passed" and not late]
+        if clear and not self.coupling.any():
+            flat = self._flat(clear, first if all(one.at == TARGETS[0] for one in clear) else None)
+        self.worlds.reset(self.seed, self.all)
+        act()
+        stale = {one: (self.worlds.stale(one.name), self.worlds.remark(one.name)) for one in asked}
+        found = {}
+        for one in asked:
+            rows = self.only(one) | (others & alone)
+            twice, undo = (final, again) if one in back else (again, final)
+            here = found[one.name] = self._responses(one)
+            here["applied"] = self._applied(one)
+            here["in range"] = taken[one]
+            if flat.get(one.name):
+                here["in range"] = Answer(status="passed", said=flat[one.name])
+            here["neighbours"] = self._neighbours(one, first, base, others)
+            here["second reset"] = self._repeated(one, self.gap(twice, first, rows))
+            here["undo"] = self._undone(one, self.gap(undo, base, rows))
+            here["partial reset"] = partly
+            here["constants"] = self._constants(*stale[one], first, act)
+        return found
+
+    def _applied(self, one: Asked) -> Answer:
+        got, before, wanted = (x[one.world] for x in (one.seen[0][1], one.before, one.values))
+        if not np.array_equal(got, before):
+            return Answer(status="passed")
+        if near(one.later, wanted):
+            return Answer(status="passed", said="after the next reset")
+        said = f"{numbers(wanted)} was set, and the engine still has {numbers(before)}"
+        return Answer(status="fault", said=said)
+
+    def _undone(self, one: Asked, left: Response | None) -> Answer:
+        if one.late or one.stuck:
+            return missing(one.stuck or "it acts only after the next reset")
+        if left is not None and one.gap is not None and left.share <= UNDONE * one.gap.share:
             return Answer(status="passed", **self.said(left, "rounding is left"))
         return self._equality(left, "the old value leaves an effect")
 
-    def _write_back(self, name: str, before: Floats, mask: Mask) -> None:
-        """Set the old value, and begin episodes: some worlds take values over only then."""
-        with suppress(InterventionError):  # of worlds that have it again after a reset
-            self.write(name, before, mask)
-        self.worlds.reset(self.seed, self.all)
-
-    def _still(self, name: str) -> str:
-        """Return why no response is declared, or nothing."""
-        return str(self.worlds.why(name)) if hasattr(self.worlds, "why") else ""
-
-    def _accepted(
-        self, name: str, space: Distribution, before: Floats
-    ) -> tuple[list[Floats], dict[str, Answer]]:
-        """Return values that world 0 takes; if there are none, all answers."""
-        tried, values, why = list[Floats](), before.copy(), "no other value lies in the range"
-        for u in TARGETS:
-            values[0] = self.value(space, name, u)
-            if near(values[0], before[0], NEAR * self._width(space, name)):
-                continue
-            try:
-                self.write(name, values, self.only)
-                tried.append(values[0].copy())
-            except InterventionError as error:
-                why = f"every value that was tried was refused, the last one because {error}"
-            except ScmWorldError as error:
-                fault = Answer(status="fault", said=str(error))
-                return [], {**none("it is not applied"), "applied": fault}
-            self._write_back(name, before, self.only)
-        return tried, none(why)
-
-    def _width(self, space: Distribution, name: str) -> Floats:
-        low, high = (self.value(space, name, u) for u in (0.0, TARGETS[0]))
-        return np.abs(high - low)
-
-    def _taken(self, name: str, space: Distribution, before: Floats, late: bool) -> Answer:
-        """Set both ends of a range, and read them back."""
-        tried = 0
+    def _taken(self, asked: list[Asked]) -> dict[Asked, Answer]:
+        """Set both ends of ranges, and read them back."""
+        found = dict.fromkeys(asked, missing("both ends were refused"))
         for u in (0.0, TARGETS[0]):
             self.worlds.reset(self.seed, self.all)
-            wanted = before.copy()
-            wanted[0] = self.value(space, name, u)
-            try:
-                self.write(name, wanted, self.only)
-            except ScmWorldError:  # such as an overlap
-                continue
-            if late:
+            wanted = {}
+            for one in asked:
+                values = one.before.copy()
+                values[one.world] = self.value(one, u)
+                with suppress(ScmWorldError):  # such as an overlap
+                    self.write(one.name, values, self.only(one))
+                    wanted[one] = values[one.world]
+            if any(one.late for one in asked):
                 self.worlds.reset(self.seed, self.all)
-            tried, got = tried + 1, self.read(name)
-            same = near(got[0], wanted[0]) or np.array_equal(got[0], before[0])
-            if not (same or self._is_alike(name, got)):
-                said = f"{numbers(wanted[0])} was set, and the engine has {numbers(got[0])}"
-                return Answer(status="fault", said=said)
-        return Answer(status="passed") if tried else missing("both ends were refused")
+            got = {one: self.read(one.name) for one in wanted}
+            poses = {one: self.read(self.worlds.target(one.name)) for one in wanted}
+            for one, value in wanted.items():
+                now = got[one][one.world]
+                same = near(now, value) or np.array_equal(now, one.before[one.world])
+                if not (same or self._is_alike(one, got[one], poses[one])):
+                    said = f"{numbers(value)} was set, and the engine has {numbers(now)}"
+                    found[one] = Answer(status="fault", said=said)
+                elif found[one].status == "not asked":
+                    found[one] = Answer(status="passed")
+        return found
 
-    def _is_alike(self, name: str, got: Floats) -> bool:
+    def _is_alike(self, one: Asked, got: Floats, pose: Floats) -> bool:
         """Return whether other coordinates are of the same pose: a centre has no polar angle."""
-        if not hasattr(self.worlds, "target") or self.worlds.target(name) == name:
+        target = self.worlds.target(one.name)
+        if target == one.name:
             return False
-        target = self.worlds.target(name)
-        pose = self.read(target)[0]
         self.worlds.reset(self.seed, self.all)
-        self.write(name, got, self.only)
-        return near(self.read(target)[0], pose, READ_BACK)
+        self.write(one.name, got, self.only(one))
+        return near(self.read(target)[one.world], pose[one.world], READ_BACK)
 
     def _flat(
-        self, name: str, space: Distribution, before: Floats, first: Callable[[], object] = int
-    ) -> str:
-        """Return between which ends and the middle of a range no state differs, or nothing."""
-        values, runs = before.copy(), list[tuple[str, PairedRun]]()
-        act = partial(self._change, name, values, [], first)
-        for u in (0.0, 0.5, TARGETS[0]):
-            self.worlds.reset(self.seed, self.all)
-            values[0] = self.value(space, name, u)
-            try:
-                runs.append((numbers(values[0]), self.run(act)))
-            except ScmWorldError:  # such as an overlap
-                return ""
-        for (low, one), (high, other) in pairwise(runs):
-            if self.gap(one, other, self.only, name) is None:
-                return f"no state differs from {low} to {high}"
-        return ""
+        self, asked: list[Asked], high: PairedRun | None, first: Callable[[], object] = int
+    ) -> dict[str, str]:
+        """Return between which ends and the middle of ranges no state differs, by name.
 
-    def _responses(self, name: str, gap: Response | None, late: bool) -> dict[str, Answer]:
+        A run ends as soon as all states have differed.
+
+        Args:
+            asked: The ranges.
+            high: The run with their upper ends, if there was one.
+            first: Called before values are set.
+        """
+        left = [*asked]
+
+        def run(u: float, other: PairedRun | None) -> PairedRun:
+            def act() -> None:
+                first()
+                for one in asked:
+                    given = one.before.copy()
+                    given[one.world] = self.value(one, u)
+                    try:
+                        self.write(one.name, given, self.only(one))
+                    except ScmWorldError:  # such as an overlap
+                        if one in left:
+                            left.remove(one)
+
+            seen = set[Asked]()
+
+            def until(step: int, states: Floats) -> bool:
+                if other is None:
+                    return False
+                far = _far(states, other.states[step]) > self.limit
+                seen.update(one for one in left if far[one.world, self.owners != one.name].any())
+                return seen.issuperset(left) or step + 1 >= len(other.states)
+
+            return self.run(act, until=until)
+
+        high = high or run(TARGETS[0], None)
+        for whole in (False, True):
+            found: dict[str, str] = {}
+            middle = run(0.5, None if whole else high)
+            runs = {TARGETS[0]: high, 0.5: middle, 0.0: run(0.0, middle)}
+            for low, above in ((0.5, TARGETS[0]), (0.0, 0.5)):
+                for one in left:
+                    ends = self.value(one, low), self.value(one, above)
+                    same = self.gap(runs[low], runs[above], self.only(one), one.name) is None
+                    if same and not np.array_equal(*ends):
+                        found[one.name] = "no state differs from {} to {}".format(
+                            *map(numbers, ends)
+                        )
+            if not found:
+                break
+        return found
+
+    def _responses(self, one: Asked) -> dict[str, Answer]:
         """Answer whether the state responds, and when."""
+        gap = one.gap
         if gap is not None:
             words = "it differs" if gap.share > ROUNDING else "it differs in rounding alone"
             at_once = Answer(status="passed")
-            if late:
+            if one.late:
                 said = "the state differs only after the next reset"
                 at_once = Answer(status="fault", said=said)
             return {
                 "responds": Answer(status="passed", **self.said(gap, words)),
                 "at once": at_once,
             }
-        why = self._still(name)
-        if not why and hasattr(self.worlds, "untouched"):
-            why = self.worlds.untouched(name)
+        why = self.worlds.idle(one.name, ran=True)
         if self.floor > 0.0:
             why = f"two equal runs differ by {self.floor:.3g} spreads, and no difference is larger"
+        if self.coupling.any() and not why:
+            why = "no difference after a step is larger than those of bodies that do not touch"
         said = f"no number of the state differs in {len(self.actions)} control steps"
-        why = why or f"{said}, and nobody declared this range" * (not self.declared)
         answer = missing(why) if why else Answer(status="fault", said=said)
         return {"responds": answer, "at once": missing("nothing responds")}
 
-    def _neighbours(self, one: PairedRun, base: PairedRun, got: Floats, before: Floats) -> Answer:
+    def _neighbours(self, one: Asked, run: PairedRun, base: PairedRun, others: Mask) -> Answer:
         if self.n == 1:
             return missing("there is one world")
-        changed = [i for i in range(1, self.n) if not _equal(got[i], before[i])]
+        before, got = one.seen[0]
+        changed = [i for i in range(self.n) if i != one.world and not _equal(got[i], before[i])]
         if changed:
             said = f"the value of world {changed[0]} became {numbers(got[changed[0]])}, too"
             return Answer(status="fault", said=said)
-        return self._equality(self.gap(one, base, ~self.only), "the states of other worlds differ")
+        return self._equality(self.gap(run, base, others), "the states of other worlds differ")
 
-    def _repeated(
-        self, act: Callable[[], None], one: PairedRun, got: list[Floats], late: bool
-    ) -> Answer:
-        for _ in range(1 + late):
-            before, one = one, self.run(act)
-        if not _equal(got[-1], got[-2]) and not late:
-            words = f"{numbers(got[-2][0])} became {numbers(got[-1][0])} when it was set again"
+    def _repeated(self, one: Asked, gap: Response | None) -> Answer:
+        before, wanted = one.before[one.world], one.values[one.world]
+        if not (near(one.later, before) or near(one.later, wanted)):
+            return Answer(status="fault", said=f"after the next reset it is {numbers(one.later)}")
+        got = [after[one.world] for _, after in one.seen]
+        drift = [] if one.late else [pair for pair in pairwise(got) if not _equal(*pair)]
+        if drift:
+            words = "{} became {} when it was set again".format(*map(numbers, drift[0]))
             return Answer(status="fault", said=words)
-        return self._equality(self.gap(one, before, self.all), "the same again gives other states")
+        return self._equality(gap, "the same again gives other states")
 
-    def _partial(self, one: PairedRun, first: Callable[[], object]) -> Answer:
+    def _partial(self, run: PairedRun, first: Callable[[], object]) -> Answer:
         """Reset the last world in the middle of a run."""
         if self.n == 1:
             return missing("there is one world")
-        last, kept = np.arange(self.n) == self.n - 1, dict[str, tuple[Floats, Floats]]()
+        self._changed = []
+        gap, found = (
+            self.gap(self.run(first, self._reset_last), run, ~self._last),
+            self._unchanged(),
+        )
+        return (
+            found
+            if found.status == "fault"
+            else self._equality(gap, "the states of other worlds differ")
+        )
 
-        def reset() -> None:
-            old = {name: self.read(name) for name in self.names}
-            self.worlds.reset(self.seed + OTHER, last)
-            kept.update({name: (old[name], self.read(name)) for name in self.names})
+    @property
+    def _last(self) -> Mask:
+        return np.asarray(np.arange(self.n) == self.n - 1)
 
-        gap = self.gap(self.run(first, reset), one, ~last)
-        for name, (old, new) in kept.items():
-            if not _equal(old[:-1], new[:-1]):
-                return Answer(status="fault", said=f"{name} changed in worlds that were not reset")
-        return self._equality(gap, "the states of other worlds differ")
+    def _reset_last(self) -> None:
+        """Reset the last world; values that change in others are kept."""
+        old = {name: self.read(name)[:-1] for name in self.names}
+        self.worlds.reset(self.seed + OTHER, self._last)
+        self._changed += [n for n in self.names if not _equal(old[n], self.read(n)[:-1])]
 
-    def _constants(self, name: str, one: PairedRun, act: Callable[[], object]) -> Answer:
-        """Compare derived constants with a fresh compilation; measure their effect."""
-        if not hasattr(self.worlds, "stale"):
-            return missing("no model of these worlds can be compiled afresh")
-        self.worlds.reset(self.seed, self.all)
-        act()
-        found = self.worlds.stale(name)
+    def _unchanged(self) -> Answer:
+        """Answer whether resets of the last world left the values of the others."""
+        if self._changed:
+            said = f"{self._changed[0]} changed in worlds that were not reset"
+            return Answer(status="fault", said=said)
+        return Answer(status="passed")
+
+    def _constants(
+        self,
+        found: Mapping[str, float] | None,
+        remark: str,
+        run: PairedRun,
+        act: Callable[[], object],
+    ) -> Answer:
+        """Judge derived constants, by those of a fresh compilation; measure their effect."""
         if found is None:
-            return missing("this engine has no model that can be compiled afresh")
-        remark = self.worlds.remark(name) if hasattr(self.worlds, "remark") else ""
+            return missing("no model of these worlds can be compiled afresh")
         if not found:
             return Answer(status="passed", said=remark)
         worst = sorted(found.items(), key=lambda item: -item[1])
-        words = f"stale: {', '.join(f'{field} ({far:.2g})' for field, far in worst)}"
-        back: list[Callable[[], None]] = []
-        gap = None
-        if hasattr(self.worlds, "refresh"):
+        words = f"stale: {', '.join(f'{name} ({far:.2g})' for name, far in worst)}"
+        back: list[Callable[[], object] | None] = []
 
-            def anew() -> None:
-                act()
-                back.append(self.worlds.refresh())
+        def anew() -> None:
+            act()
+            back.append(self.worlds.refresh())
 
-            fresh = self.run(anew)
-            gap = self.gap(fresh, one, self.all)
+        gap = self.gap(self.run(anew), run, self.all)
+        if back[0] is not None:
             back[0]()
-        verb = "; fresh ones move the state" if gap else "; fresh ones move nothing in this run"
-        said = self.said(gap, words + verb)
+            words += (
+                "; fresh ones move the state" if gap else "; fresh ones move nothing in this run"
+            )
+        said = self.said(gap, words)
         said["said"] += f"; {remark}" * bool(remark)
         return Answer(status="fault", **said)
 
@@ -471,69 +665,64 @@ class Asking:
 
     def drawn(self, name: str, space: Distribution) -> dict[str, Answer]:
         """Answer all questions about values that are drawn at resets."""
-        draws, seeds = getattr(self.worlds, "draws", True), range(1, self.resets + 1)
+        one, draws, seeds = Asked(name, space), self.worlds.draws, range(1, self.resets + 1)
         values = np.array([self._after(self.seed + OTHER * i, name) for i in seeds])
-        ends = [self.value(space, name, u) for u in (0.0, TARGETS[0])]
+        ends = self.ends(one)
         found = judge(values.reshape(self.resets, self.n, -1), *map(np.ravel, ends), draws=draws)
         found["undo"] = missing("the environments draw their values themselves")
         again = [self._after(self.seed, name) for _ in range(2)]
         if found["second reset"].status == "passed" and not _equal(*again):
             said = "the same seed gives other values"
             found["second reset"] = Answer(status="passed", said=said)
-        fix, before = self.kept(), self.read(name)
-        base = self.run(fix)
+        fix, one.before = self.worlds.keep(self.names), self.read(name)
+        base, before = self.run(fix), one.before[0]
+
+        def act() -> None:
+            fix()
+            self._act([one])
+
         if not self.can_set:
             absent = missing("these environments have no method set")
             found |= dict.fromkeys(("responds", "at once", "neighbours"), absent)
         else:
             width = NEAR * np.abs(ends[1] - ends[0])
-            tried = [self._reference(name, before)[0], *ends]
-            tried = [one for one in tried if not near(one, before[0], width)]
-            other = before.copy()
-            got: list[Floats] = []
-            act = partial(self._change, name, other, got, fix)
-            for other[0] in tried:
-                one = self.run(act)
-                gap = self.gap(one, base, self.only, name)
-                if gap is not None:
+            tried = [np.asarray(self.worlds.reference(name), dtype=np.float64)[0], *ends]
+            tried = [value for value in tried if not near(value, before, width)]
+            one.values = one.before.copy()
+            for one.values[0] in tried:
+                one.seen = []
+                run = self.run(act)
+                one.gap = self.response(run, base, one)
+                if one.gap is not None:
                     break
-            found |= self._responses(name, gap, late=False)
-            if gap is not None and found["in range"].status == "passed":
-                said = self._flat(name, space, before, fix)
+            found |= self._responses(one)
+            if one.gap is not None and found["in range"].status == "passed":
+                said = self._flat([one], None, fix).get(name, "")
                 found["in range"] = Answer(status="passed", said=said)
-            found["neighbours"] = self._neighbours(one, base, got[0], before)
-            if found["at once"].status == "passed" and hasattr(self.worlds, "outdated"):
-                found["at once"] = self._first_observation(name, other)
+            found["neighbours"] = self._neighbours(one, run, base, ~self.only(one))
+            if found["at once"].status == "passed":
+                found["at once"] = self._first_observation(one)
         found["partial reset"] = self._partial(base, fix) if draws else missing("nothing is reset")
-        found["constants"] = self._constants(name, base, fix)
+        self.worlds.reset(self.seed, self.all)
+        fix()
+        stale = self.worlds.stale(name), self.worlds.remark(name)
+        found["constants"] = self._constants(*stale, base, fix)
         fix()
         return found
-
-    def kept(self) -> Callable[[], None]:
-        """Return what writes the present values again, whatever a reset draws."""
-        if hasattr(self.worlds, "keep"):
-            back: Callable[[], None] = self.worlds.keep()
-            return back
-        kept = {name: self.read(name) for name in self.names if self.can_set}
-
-        def fix() -> None:
-            for name, value in kept.items():
-                self.write(name, value)
-
-        return fix
 
     def _after(self, seed: int, name: str) -> Floats:
         self.worlds.reset(seed, self.all)
         return self.read(name)
 
-    def _first_observation(self, name: str, other: Floats) -> Answer:
+    def _first_observation(self, one: Asked) -> Answer:
         """Answer whether the first observation is of the values that were drawn."""
         self.worlds.reset(self.seed, self.all)
-        old = self.worlds.outdated()[0]
-        self.write(name, other, self.only)
-        if not old or self.worlds.outdated()[0] == old:
+        old = self.worlds.outdated()
+        self._act([one])
+        new = self.worlds.outdated()
+        if old is None or new is None or not old[0] or new[0] == old[0]:
             return Answer(status="passed")
-        said = f"the first observation shows the values before: it differs by {old:.3g}"
+        said = f"the first observation shows the values before: it differs by {old[0]:.3g}"
         return Answer(status="fault", said=said)
 
 

@@ -11,14 +11,15 @@ from typing import Any, final
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import iterate
 
 from scm_world._arguments import one_of, true_or_false, typed, whole_number
-from scm_world._types import Floats, Integers, Mask
+from scm_world._types import ArrayLike, Floats, Integers, Mask, Observation
 from scm_world.env.actions import JOINTS
 from scm_world.env.arguments import RESETS, reset_options
-from scm_world.env.environment import EnvSnapshot, ScmWorldEnv
+from scm_world.env.environment import EnvSnapshot, ScmWorldEnv, unwrapped_env
 from scm_world.errors import (
     ActionError,
     EngineFailure,
@@ -36,6 +37,18 @@ from scm_world.variables.subsets import AnyRegion
 from scm_world.world import Audit
 from scm_world.world.batch import located, read_actions, read_mask, read_seeds
 from scm_world.world.mechanisms import Rows
+
+WHOLE = slice(None)
+"""All rows."""
+
+Places = int | Integers | slice
+"""One row, or several."""
+
+Seeds = int | Sequence[int | None] | None
+"""A seed that counts up, or one for each."""
+
+OfEach = Mapping[Any, Any] | Sequence[Any]
+"""One for each in a list, or some by index; or one mapping for all."""
 
 Stepped = tuple[Any, Floats, Mask, Mask, dict[str, Any]]
 
@@ -89,30 +102,27 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         self._how: dict[str, Any] = {"num_envs": count, "copy": copy, "threads": threads}
         self._how |= {"autoreset_mode": mode_of(autoreset_mode), "member": member, **options}
         with blamed("member"):
-            first: Any = member(**options)
-            lead: Any = first.unwrapped
+            first = member(**options)
+            lead = unwrapped_env(first, "a batch")
         # They share declarations, and each can be made again by itself.
         shared = {**options, "task": lead.world.structures, "task_options": None}
         makers: list[Any] = [lambda: first, *[partial(member, **shared)] * (count - 1)]
         super().__init__(makers, copy=copy, autoreset_mode=self._how["autoreset_mode"])
-        self._lead: ScmWorldEnv = lead
-        self._inner: list[Any] = [env.unwrapped for env in self.envs]
+        self._inner: list[ScmWorldEnv] = [unwrapped_env(env, "a batch") for env in self.envs]
         for inner in self._inner:
             inner._ezpickle_kwargs = lead._ezpickle_kwargs
         self._shapes = _shapes(first)
         self._known: dict[str, Any] = {}  # a column of all environments for each entry of ``info``
-        self._begun, self._all = np.zeros(count, bool), np.arange(count)
         reads = lead.actions.reads
         self._names = (*lead.observer.needed, *(() if reads is None else (reads,)))
         worlds: list[Any] = [inner.world for inner in self._inner]
         self._batch = worlds[0].batched(worlds, threads=threads, names=self._names)
-        self._commands = np.empty((count, lead.world.compiled.n_actions))
         self._counting = hasattr(first, "over")
 
     # --- episodes ---------------------------------------------------------------------------------
 
     def reset(
-        self, *, seed: Any = None, options: dict[str, Any] | None = None
+        self, *, seed: Seeds = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode in all environments, or in some; all of those are reset, or none.
 
@@ -137,16 +147,14 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         try:
             self._act("reset", asked)
         except InterventionError:
-            if not any("do" in one.get("options", {}) for one in asked.values()):
-                raise
-            # The episodes begin without what was refused.
-            with suppress(InterventionError):  # what is done at every reset may be refused, too
-                self._act("reset", {index: _without_do(one) for index, one in asked.items()})
-                self._begun[[*asked]], self._autoreset_envs[[*asked]] = True, False
+            given = [one.get("options", {}).pop("do", None) for one in asked.values()]
+            if any(one is not None for one in given):  # the episodes begin without it
+                with suppress(InterventionError):  # what is done at every reset may be refused, too
+                    self._reset(asked)
             raise
-        self._begun[[*asked]], self._autoreset_envs[[*asked]] = True, False
+        self._autoreset_envs[[*asked]] = False
 
-    def step(self, actions: Any) -> Stepped:
+    def step(self, actions: ArrayLike) -> Stepped:
         """Advance all environments one control step.
 
         If an action is refused, none moves. If one environment fails as it is stepped, all others
@@ -167,8 +175,9 @@ class ScmWorldVectorEnv(SyncVectorEnv):
             advice = "reset them first with options={'reset_mask': terminations | truncations}"
             raise ActionError(f"environments that are done take no step: {done}; {advice}", actions)
         stepping = ~self._autoreset_envs if len(begun) else None
-        listed = self._lead.actions.chosen(actions)
-        given = read_actions(listed, stepping, self._commands.shape, "environment")
+        lead = self._inner[0]
+        shape = self.num_envs, lead.world.compiled.n_actions
+        given = read_actions(lead.actions.chosen(actions), stepping, shape, "environment")
         if len(begun):
             self._reset({index: {} for index in begun.tolist()})
             self._rewards[begun] = 0.0
@@ -191,8 +200,9 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         return self._shown(), self._rewards.copy(), *flags, infos
 
     def _require_episodes(self) -> None:
-        if not self._begun.all():
-            raise located(NotReset(), int(np.argmin(self._begun)), "environment")
+        for row, inner in enumerate(self._inner):
+            if not inner.world.has_begun:
+                raise located(NotReset(), row, "environment")
 
     def _shown(self) -> Any:
         shown = self._observations
@@ -204,21 +214,20 @@ class ScmWorldVectorEnv(SyncVectorEnv):
 
     def _advance(self, which: Mask | None, actions: Floats) -> None:
         """Step some environments, all if None. If one fails, all others are one step further."""
-        rows = self._all if which is None else np.flatnonzero(which)
+        rows = np.arange(self.num_envs) if which is None else np.flatnonzero(which)
         if not len(rows):
             return
         commands = self._commanded(rows, actions)
-        before = self._batch._by_structure(rows) if self._lead.truncates_failures else []
+        before = self._batch.by_structure(rows) if self._inner[0].truncates_failures else []
         kept = [table.numbers[members] for table, members in before]
         moved = rows
         try:
             self._batch.advance(commands, which)
         except (FunctionFailure, EngineFailure) as error:
             if not (kept and isinstance(error, EngineFailure) and error.diverged):
-                self._read_alone(rows)
+                self._read_alone(rows.tolist())
                 raise located(error, error.row or 0, "environment") from error.__cause__
             failed = np.union1d(error.lost, error.unmoved).astype(int)
-            moved = np.setdiff1d(rows, failed)
             for (table, members), numbers in zip(before, kept, strict=True):
                 ended = np.isin(members, failed)
                 table.numbers[members[ended]] = numbers[ended]
@@ -226,12 +235,11 @@ class ScmWorldVectorEnv(SyncVectorEnv):
                 self._write(row, *self._inner[row].present_of_failure())
             self._rewards[failed] = 0.0
             self._terminations[failed], self._truncations[failed] = False, True
-        for table, members in self._batch._by_structure(moved):
+            moved = np.setdiff1d(rows, failed)
+        for table, members in self._batch.by_structure(moved):
             if moved is not rows:
                 table.evaluate(self._names, members)
-            whole = len(members) == self.num_envs
-            now = table if whole else Rows(table.compiled, table.numbers[members])
-            self._take(self._inner[int(members[0])], now, members)
+            self._take(table, members)
         ended = self._terminations | self._truncations
         for row in rows.tolist():
             if self._inner[row].world.is_planned and not ended[row]:
@@ -241,8 +249,12 @@ class ScmWorldVectorEnv(SyncVectorEnv):
             for row in rows[ended[rows]].tolist():
                 self.envs[row].get_wrapper_attr("over")(success=bool(success[row]))
 
-    def _take(self, lead: ScmWorldEnv, now: Rows, rows: Integers) -> None:
-        """Write what a step led to in environments of one structure; ``lead`` is one of them."""
+    def _take(self, table: Rows, rows: Integers) -> None:
+        """Write what a step led to in environments of one structure."""
+        lead, now = self._inner[int(rows[0])], table
+        place: Places = WHOLE
+        if len(rows) < self.num_envs:
+            now, place = Rows(table.compiled, table.numbers[rows]), rows
         lead.follow()
         rewards, ended, info = lead.observer.outcome(now)
         for row in rows[~np.isfinite(rewards)].tolist():
@@ -251,11 +263,11 @@ class ScmWorldVectorEnv(SyncVectorEnv):
                 one_number(env._look(), REWARD, env.world.task.weights)
             except ScmWorldError as error:
                 raise located(error, row, "environment") from error.__cause__
-        self._rewards[rows] = lead.reward_scale * rewards
-        self._terminations[rows] = ended
-        self._truncations[rows] = now.numbers[:, now.compiled.clock] >= lead.limit
+        self._rewards[place] = lead.reward_scale * rewards
+        self._terminations[place] = ended
+        self._truncations[place] = now.numbers[:, now.compiled.clock] >= lead.limit
         observation = lead.observer.observe(now) if lead.observer.together else None
-        self._write(rows, observation, info)
+        self._write(place, observation, info)
         alone = rows if observation is None else rows[:0]
         if SENSOR_NOISE in now and observation is not None:
             alone = rows[now[SENSOR_NOISE] != 0.0]
@@ -264,20 +276,17 @@ class ScmWorldVectorEnv(SyncVectorEnv):
 
     def _commanded(self, rows: Integers, actions: Floats) -> Floats:
         """Return the commands of some environments, shape (n, n_actions)."""
-        how = self._lead.actions
+        how = self._inner[0].actions
         if how.relative:
             actions = np.array(actions)
-            for table, members in self._batch._by_structure(rows):
+            for table, members in self._batch.by_structure(rows):
                 offset = (table.actions if how.reads is None else table[how.reads])[members]
-                if how.reads is None and self._lead.world.options.action_mode == JOINTS:
+                if how.reads is None and self._inner[0].world.options.action_mode == JOINTS:
                     # Where joints were put since the last command, actions are relative to them.
                     put = np.array([self._inner[row].actions.is_set() for row in members.tolist()])
                     offset = np.where(put[:, None], table[JOINTS][members], offset)
                 actions[members] = how.moved(actions[members], offset)
-        if rows is self._all:
-            return how.commands(actions)
-        self._commands[rows] = how.commands(actions[rows])
-        return self._commands
+        return how.commands(actions)
 
     def _follow_plan(self, row: int) -> None:
         """Do what the plan of one environment contains after a control step."""
@@ -296,17 +305,20 @@ class ScmWorldVectorEnv(SyncVectorEnv):
 
     def _act(self, method: str, given: Mapping[int, Mapping[str, Any]]) -> dict[int, Any]:
         """Call a method that changes environments, in all that are named or in none."""
-        answers, before, index = {}, {}, 0
+        answers, index = dict[int, Any](), 0
+        back: dict[int, Callable[[], None]] = {}
         try:
             for index, arguments in given.items():
-                world = self._inner[index].world
-                if world.has_begun and not world.is_lost:  # else there is nothing to lose
-                    before[index] = self.envs[index].get_wrapper_attr("snapshot")()
+                world, attribute = self._inner[index].world, self.envs[index].get_wrapper_attr
+                if world.has_begun and not world.is_lost:
+                    back[index] = partial(attribute("restore"), attribute("snapshot")())
+                else:
+                    back[index] = world.way_back()
                 answers[index] = self._change(index, method, arguments)
         except BaseException as error:
-            for row, snapshot in before.items():
-                self.envs[row].get_wrapper_attr("restore")(snapshot)
-                self._write(row, *self._inner[row].present())
+            for undo in back.values():
+                undo()
+            self._read_alone(back)
             if isinstance(error, ScmWorldError):
                 located(error, index, "environment")
             raise
@@ -331,26 +343,28 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         self._write(row, *shown)
         return answer
 
-    def _write(self, rows: Any, observation: Any, info: Mapping[str, Any]) -> None:
+    def _write(
+        self, rows: Places, observation: Observation | None, info: Mapping[str, Any]
+    ) -> None:
         if isinstance(observation, dict):
             _put(self._observations, rows, observation, self.num_envs)
         elif observation is not None:
             self._observations[rows] = observation
         _put(self._known, rows, info, self.num_envs)
 
-    def _read_alone(self, rows: Integers) -> None:
+    def _read_alone(self, rows: Iterable[int]) -> None:
         """Read environments one by one; the row of one that cannot be read stays as it is."""
-        for row in rows.tolist():
+        for row in rows:
             with suppress(ScmWorldError):
                 self._write(row, *self._inner[row].present())
 
     def present(self) -> tuple[Any, dict[str, Any]]:
         """Return observations and infos of the present, as after an intervention."""
         self._require_episodes()
-        self._read_alone(np.arange(self.num_envs))
+        self._read_alone(range(self.num_envs))
         return self._shown(), infos_of(self._known, np.ones(self.num_envs, bool))
 
-    def do(self, requests: Any, *, space: AnyRegion | None = None) -> dict[int, Audit]:
+    def do(self, requests: OfEach, *, space: AnyRegion | None = None) -> dict[int, Audit]:
         """Intervene now, in all environments that are named or in none; see ``ScmWorldEnv.do``.
 
         Args:
@@ -370,17 +384,18 @@ class ScmWorldVectorEnv(SyncVectorEnv):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return the parts for copying and pickling: the options, and a snapshot of each."""
-        alive = (row for row in np.flatnonzero(self._begun).tolist())
-        saved = {row: self._snapshot(row) for row in alive if not self._inner[row].world.is_lost}
+        worlds = enumerate(inner.world for inner in self._inner)
+        alive = [row for row, world in worlds if world.has_begun and not world.is_lost]
+        saved = {row: self._snapshot(row) for row in alive}
         return _copied, (self._how, saved, self.__dict__.get("spec"))
 
     def _snapshot(self, index: int) -> EnvSnapshot:
-        if not self._begun[index]:
+        if not self._inner[index].world.has_begun:
             raise located(NotReset(), index, "environment")
         found: EnvSnapshot = self.envs[index].get_wrapper_attr("snapshot")()
         return replace(found, ended=bool(self._autoreset_envs[index]))
 
-    def restore(self, snapshot: Any) -> None:
+    def restore(self, snapshot: EnvSnapshot | OfEach) -> None:
         """Restore a snapshot, bit for bit; see ``ScmWorldEnv.restore``.
 
         Args:
@@ -390,7 +405,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         wanted = spread("restore", snapshot, self.num_envs)
         self._act("restore", {index: {"snapshot": one} for index, one in wanted.items()})
         for index, one in wanted.items():
-            self._begun[index], self._autoreset_envs[index] = True, one.ended
+            self._autoreset_envs[index] = one.ended
 
     def branch(self, source: int, into: int | Iterable[int] | None = None) -> None:
         """Copy the state of one environment into others: from here on they are its counterfactuals.
@@ -402,14 +417,16 @@ class ScmWorldVectorEnv(SyncVectorEnv):
             source: Index of the one that is copied.
             into: Index or indices of those that become like it; all if None.
         """
-        saved = self._snapshot(index_of(source, self.num_envs))
+        saved = self._snapshot(numbered(source, self.num_envs))
         given = range(self.num_envs) if into is None else into
         others: list[Any] = [*given] if isinstance(given, Iterable) else [given]
         if others:
-            self.restore({index_of(index, self.num_envs): saved for index in others})
+            self.restore(dict.fromkeys(others, saved))
 
 
-def _copied(how: Mapping[str, Any], saved: Mapping[int, EnvSnapshot], spec: Any) -> Any:
+def _copied(
+    how: Mapping[str, Any], saved: Mapping[int, EnvSnapshot], spec: EnvSpec | None
+) -> ScmWorldVectorEnv:
     made = ScmWorldVectorEnv(**how)
     made.spec = spec
     if saved:
@@ -427,14 +444,14 @@ def _shapes(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
     return {**env.get_wrapper_attr("info_shapes"), **{n: part.shape for n, part in parts.items()}}
 
 
-def _put(columns: dict[str, Any], rows: Any, values: Mapping[str, Any], size: int) -> None:
+def _put(columns: dict[str, Any], rows: Places, values: Mapping[str, Any], size: int) -> None:
     """Write one row of columns, or several; columns that are missing begin as zeros."""
     for name, value in values.items():
         if isinstance(value, dict):
             _put(columns.setdefault(name, {}), rows, value, size)
             continue
         if name not in columns:
-            shape = np.shape(value)[np.ndim(rows) :]
+            shape = np.shape(value)[np.ndim(np.arange(size)[rows]) :]
             columns[name] = np.zeros((size, *shape), np.asarray(value).dtype)
         columns[name][rows] = value
 
@@ -459,13 +476,14 @@ def infos_of(columns: Mapping[str, Any], which: Mask) -> dict[str, Any]:
 # --- arguments ------------------------------------------------------------------------------------
 
 
-def _without_do(arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arguments of a reset without its intervention."""
-    options = arguments.get("options", {})
-    return {**arguments, "options": {n: one for n, one in options.items() if n != "do"}}
+def numbered(index: object, size: int) -> int:
+    """Return the checked index of an environment."""
+    return whole_number("environment", index, least=0, most=size - 1)
 
 
-def spread(what: str, given: Any, size: int, among: Iterable[int] | None = None) -> dict[int, Any]:
+def spread(
+    what: str, given: object, size: int, among: Iterable[int] | None = None
+) -> dict[int, Any]:
     """Return the request for each environment.
 
     Example:
@@ -476,7 +494,8 @@ def spread(what: str, given: Any, size: int, among: Iterable[int] | None = None)
     """
     known = [*range(size)] if among is None else [*among]
     if isinstance(given, Mapping) and any(not isinstance(key, str) for key in given):
-        found = {index_of(key, size): one for key, one in given.items() if one is not None}
+        asked = ((index, one) for index, one in given.items() if one is not None)
+        found = {numbered(index, size): one for index, one in asked}
         if not found.keys() <= {*known}:
             raise UnknownOption(f"environments for {what}", [*found], ("those that are reset",))
         return found
@@ -487,11 +506,3 @@ def spread(what: str, given: Any, size: int, among: Iterable[int] | None = None)
     if len(given) != size:
         raise UnknownOption(f"list for {what}", given, (f"one of length {size}",))
     return {index: given[index] for index in known if given[index] is not None}
-
-
-def index_of(index: Any, size: int) -> int:
-    """Read the index of an environment."""
-    is_whole = isinstance(index, int | np.integer) and not isinstance(index, bool)
-    if not is_whole or not 0 <= index < size:
-        raise UnknownOption("environment", index, (f"any whole number from 0 to {size - 1}",))
-    return int(index)

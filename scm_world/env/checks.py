@@ -10,8 +10,9 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from scm_world._arguments import typed, whole_number
-from scm_world.env.answers import QUESTIONS, TARGETS, Answer, Checkable, Status, is_pair, numbers
-from scm_world.env.asking import Asking
+from scm_world.backends.checkable import Checkable
+from scm_world.env.answers import QUESTIONS, Answer, Status, is_pair, numbers
+from scm_world.env.asking import Asked, Asking
 from scm_world.env.batch import ScmWorldVectorEnv
 from scm_world.env.ours import OurWorlds
 from scm_world.errors import UnknownOption
@@ -178,15 +179,17 @@ def check(
 ) -> Check:
     """Check whether declared ranges of parameters are real in many environments.
 
-    Each range is changed in one world, in runs with equal noise and equal actions. Differences
+    Each range is changed in one world, in runs with equal noise and equal actions; at most one
+    range less than there are worlds is changed in one run. Where anything of it is not as it should
+    be, each is asked about alone. Differences
     count above the floor, which is measured first: two equal runs. Where that is zero, numbers are
     compared bit for bit. A question that cannot be asked is reported as not asked.
 
     Args:
         envs: Worlds, ``World(…, num_worlds=n)``; our vector environments in one process;
             Gymnasium's ``SyncVectorEnv`` of MuJoCo environments; models of ``mujoco.rollout``: a
-            list of ``MjModel``, or a pair of it and an ``MjData`` or initial states; or any object
-            with the methods of ``Checkable``.
+            list of ``MjModel``, or a pair of it and an ``MjData`` or initial states; or an
+            object of a subclass of ``Checkable``.
         ranges: By name: ``(low, high)``, a space or a ``Draw``; or, by the value without
             randomisation, ``Scale(Draw(0.5, 1.5))`` or ``Shift(Draw(-0.1, 0.1))``. If None, the
             spaces A of our worlds, and 0.8 to 1.2 times the usual fields of others' MuJoCo models.
@@ -218,32 +221,33 @@ def check(
     begun, steps = time.perf_counter(), whole_number("steps", steps, least=1)
     resets, seed = whole_number("resets", resets, least=4), whole_number("seed", seed, least=0)
     worlds = adapted_to(envs, given=ranges is not None)
-    usual = "set" if hasattr(worlds, "set") else "reset"
-    how: Any = by or getattr(worlds, "by", usual)
-    if how == "set" and usual == "reset":
-        raise UnknownOption("by", by, ("'reset': these environments have no method set",))
     asked = Asking(worlds, seed, steps, resets)
+    if by == "set" and not asked.can_set:
+        raise UnknownOption("by", by, ("'reset': these environments have no method set",))
+    how = by or (worlds.by if asked.can_set else "reset")
     spaces = asked.spaces(ranges)
-    if hasattr(worlds, "follows"):
-        worlds.follows = how == "set"
-    asked.measure(asked.kept() if how == "reset" else int)
-    found = []
-    for number, (name, space) in enumerate(spaces.items()):
-        answers = asked.set_from_outside(name, space) if how == "set" else asked.drawn(name, space)
-        low, high = (np.ravel(asked.value(space, name, u)) for u in (0.0, TARGETS[0]))
-        found.append(
-            RangeReport(
-                name=name,
-                low=tuple(low.tolist()),
-                high=tuple(high.tolist()),
-                unit=asked.unit(name),
-                answers={question: answers[question] for question in QUESTIONS},
-            )
-        )
+    worlds.follows = how == "set"
+    asked.measure(worlds.keep(asked.names) if how == "reset" else int)
+
+    def tell(count: int) -> None:
         if progress is not None:
-            progress(number + 1, len(spaces))
+            progress(count, len(spaces))
+
+    answers: dict[str, dict[str, Answer]] = {}
+    if how == "set":
+        answers = asked.set_from_outside(spaces, tell)
+    else:
+        for name, space in spaces.items():
+            answers[name] = asked.drawn(name, space)
+            tell(len(answers))
+    found = []
+    for name, space in spaces.items():
+        low, high = (tuple(np.ravel(end).tolist()) for end in asked.ends(Asked(name, space)))
+        here = {question: answers[name][question] for question in QUESTIONS}
+        unit = worlds.unit(name)
+        found.append(RangeReport(name=name, low=low, high=high, unit=unit, answers=here))
     return Check(
-        worlds=getattr(worlds, "title", type(getattr(worlds, "envs", envs)).__name__),
+        worlds=worlds.title or type(worlds).__name__,
         num_worlds=worlds.num_envs,
         by=how,
         steps=steps,
@@ -256,7 +260,7 @@ def check(
     )
 
 
-def adapted_to(envs: Any, *, given: bool) -> Any:
+def adapted_to(envs: Any, *, given: bool) -> Checkable:
     """Return what answers the questions of ``check``."""
     if isinstance(envs, ScmWorldVectorEnv | EngineWorlds | EquationWorlds):
         return OurWorlds(envs)
@@ -271,13 +275,13 @@ def adapted_to(envs: Any, *, given: bool) -> Any:
         from scm_world.backends.mujoco.adapters import RolloutModels
 
         return RolloutModels(*pair)
-    if isinstance(envs, Checkable) and not isinstance(envs, type):
+    if isinstance(envs, Checkable):
         return envs
     allowed = (
         "World(…, num_worlds=n)",
         "a vector environment of ours in one process (workers=1)",
         "a SyncVectorEnv of MuJoCo environments",
         "a list of MjModel",
-        "an object with num_envs, n_actions, get, reset, step and observe",
+        "an object of a subclass of Checkable",
     )
     raise UnknownOption("envs", type(envs).__name__, allowed)

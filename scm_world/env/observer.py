@@ -71,7 +71,7 @@ class GoalVectors:
 
     def reward(self, achieved: ArrayLike, desired: ArrayLike) -> Floats:
         """Compute the part of the reward that goals alone decide; see ``goal_reward``."""
-        both: Any = finite_numbers(achieved), finite_numbers(desired)
+        both: tuple[Any, Any] = finite_numbers(achieved), finite_numbers(desired)
         for name, goal in zip(self.spaces, both, strict=True):
             if goal is None or goal.shape[-1:] != (self.size,):
                 given = achieved if name == "achieved_goal" else desired
@@ -144,6 +144,8 @@ class Observer:
         observe: Given the present values of one world or of several, the observation.
         needed: The variables that have to be computed.
         together: Whether several worlds can be observed in one call.
+        outcomes: Columns of reward, end of the episode, success and fractional success; None of
+            what there is not.
     """
 
     def __init__(
@@ -179,7 +181,7 @@ class Observer:
         listed = (REWARD, TERMINATED, *terms, FRACTION, SUCCESS)
         columns = {name: where[name].start for name in listed if name in where}
         self._terms = [(name, columns[name]) for name in terms]
-        self._columns = [columns.get(name) for name in (REWARD, TERMINATED, SUCCESS, FRACTION)]
+        self.outcomes = [columns.get(name) for name in (REWARD, TERMINATED, SUCCESS, FRACTION)]
         goals = () if self.goals is None else self.goals.names
         names = [name for part in self.parts.values() for name in part.names]
         self.names = (*names, *(() if self._shown is None else goals))
@@ -195,8 +197,8 @@ class Observer:
         """Return the reward, whether the episode ends, and the info: of several worlds columns."""
         numbers = now.numbers
         info: dict[str, Any] = {}
-        take: Any = numbers.item if numbers.ndim == 1 else numbers.T.__getitem__
-        reward, ended, success, fraction = self._columns
+        take: Callable[[Any], Any] = numbers.item if numbers.ndim == 1 else numbers.T.__getitem__
+        reward, ended, success, fraction = self.outcomes
         if success is not None:
             info["is_success"] = info["success"] = take(success) != 0.0
         if fraction is not None:
@@ -214,7 +216,7 @@ class Observer:
     def info_shapes(self) -> dict[str, tuple[int, ...]]:
         """The shape of each entry of ``info``, without ``reward_terms``, which is a dictionary."""
         goals = {} if self.goals is None else self.goals.spaces
-        _, _, success, fraction = self._columns
+        _, _, success, fraction = self.outcomes
         flags = {"is_success": success, "success": success, "fractional_success": fraction}
         return {
             **{name: () for name, column in flags.items() if column is not None},

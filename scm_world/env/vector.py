@@ -209,6 +209,30 @@ class Vector:
             raw = raw + noise * self._spread * drawn
         return self._of(raw)
 
+    def on_columns(self, made: Callable[[Floats], Any]) -> Callable[..., Any] | None:
+        """Return what observes columns of values, shape (width, n), as an array (n, k).
+
+        It takes the numbers that the noise of the sensors scales, too, shape (n, k).
+
+        None if that cannot be: a view of a hand, or the signs of the predecessor's quaternions.
+
+        Args:
+            made: Makes an array of the library of the columns.
+        """
+        if self._turns or self._view is not None:
+            return None
+        shifts = np.where(self._scales[4] == 0.0, -0.0, self._scales[4])  # it changes no zero
+        low, high, gain, offset, more = (made(one[:, None]) for one in (*self._scales[:4], shifts))
+        where, spread = self._scales[5].astype(int), made(self._spread[:, None])
+
+        def observe(table: Any, drawn: Any = None) -> Any:
+            raw = table[where] + more
+            if drawn is not None:
+                raw = raw + table[self._noise] * spread * drawn.T
+            return (raw.clip(low, high) * gain + offset).T
+
+        return observe
+
     def observe_values(self, values: Values) -> NDArray[np.float32]:
         """Return the observation of other values, without noise, shape (n,)."""
         given = {n: np.zeros(at.stop - at.start) for n, at in self.layout.items()} | {**values}
@@ -239,5 +263,5 @@ class Vector:
 
 def box(low: Floats, high: Floats) -> gymnasium.spaces.Box[np.float32]:
     """Return a space of 32-bit floats."""
-    bounds: Any = (low.astype(np.float32), high.astype(np.float32))
+    bounds: tuple[Any, Any] = (low.astype(np.float32), high.astype(np.float32))
     return gymnasium.spaces.Box(*bounds, dtype=np.float32)

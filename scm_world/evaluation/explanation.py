@@ -195,7 +195,7 @@ def why(
     where: dict[str, Any] = {"seed": seed, "episode": episode, "who": (agent, run)}
     found, left_out = [], {}
     with closing(setup.env(engine, actor)) as env:
-        env.world.require_exact("an explanation of an episode")
+        env.world.require_exact("an explanation of an episode", independent=True)
         row = scored_episode(env, actor, done_there, **where)
         if row["hash"] != one.only(run=run, seed=seed).frame["hash"][0]:
             made = ", ".join(f"{n} {v}" for n, v in evaluation.about["versions"][engine].items())

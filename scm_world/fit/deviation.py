@@ -13,7 +13,7 @@ from scm_world._arguments import typed, whole_number
 from scm_world._types import Floats
 from scm_world.fit.fitting import arguments_of, described
 from scm_world.fit.problem import STEP, FitProblem, Search
-from scm_world.fit.recordings import Begins, Noise, Recording
+from scm_world.fit.recordings import Begins, Noise, Reading, Recording
 from scm_world.fit.result import MISFIT, Fit
 from scm_world.fit.search import SAME, TRUST, Minima, Result, bounded, gauss_newton
 from scm_world.fit.shooting import Shooting
@@ -174,12 +174,15 @@ def explain(
     window: int | None = None,
     begins: Begins = None,
     setups: Sequence[Mapping[str, object]] | None = None,
+    columns: Mapping[str, str] | None = None,
+    ignore: Iterable[str] = (),
     progress: Progress | None = None,
     search: Search = gauss_newton,
 ) -> Deviation:
     """Fit candidates to a recording, and compare them; see ``World.explain`` and ``Search``."""
     most, world = whole_number("most", most, least=1), world.for_fit(recording)
-    measured, targets = arguments_of(world, recording, candidates, window, begins, setups)
+    how = window, begins, Reading(setups, columns, ignore)
+    measured, targets = arguments_of(world, recording, candidates, *how)
     given = measured.given(noise)
     with Shooting(world, measured, targets) as shooting:
         problem = FitProblem(shooting, measured, targets, given, window)
@@ -314,7 +317,7 @@ class _Comparison:
             explained = any(map(_explains, self._fits.values()))
             if likely or place < (0 if around else FEWEST) or (place < MANY and not explained):
                 begin, enough = self._minima[around], ABANDON * least
-                how: Any = {"thorough": False, "enough": enough}
+                how: dict[str, Any] = {"thorough": False, "enough": enough}
                 minimum = self._search.found(active, begin, values=scaled, **how)
                 if minimum.loss <= enough:
                     self._keep(names, minimum)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -21,16 +22,25 @@ from scm_world.fit.problem import (
     FitProblem,
     LeastSquares,
     Minimum,
+    Outlier,
     Search,
     spread_of,
     windows_of,
 )
-from scm_world.fit.recordings import Begins, Measurements, Noise, Recording, begun, read_recording
+from scm_world.fit.recordings import (
+    Begins,
+    Measurements,
+    Noise,
+    Reading,
+    Recording,
+    begun,
+    read_recording,
+)
 from scm_world.fit.result import DETERMINED, Fit
 from scm_world.fit.search import SAME, SEARCHES, Minima, Result, gauss_newton
 from scm_world.fit.shooting import Shooting
 from scm_world.fit.targets import Target, acting, targets_of, twin_of
-from scm_world.fit.units import check_units
+from scm_world.fit.units import check_units, reading_of
 from scm_world.queries.progress import Progress
 from scm_world.queries.world import World
 
@@ -39,6 +49,7 @@ BETTER = 3  # minima that are found along a profile, at most
 TRIALS = 12  # of an end of an interval, at most
 NEARLY = 0.25  # of a distance with its squares, from which the end of an interval can be determined
 RIDGE = 30.0  # times the error with all others known, of a parameter that others can replace
+PEELS = 3  # times that outliers are left out
 END = 0.1  # largest deviation of the root of the squares at an end of an interval, relative
 OPEN = 300.0  # scaled distance up to which an end is searched
 PROFILE = 8  # largest number of steps at the end of an interval
@@ -56,19 +67,21 @@ def fit(
     begins: Begins = None,
     held_out: float | None = None,
     setups: Sequence[Mapping[str, object]] | None = None,
+    columns: Mapping[str, str] | None = None,
+    ignore: Iterable[str] = (),
     symmetric: bool = False,
     progress: Progress | None = None,
     search: Search = gauss_newton,
 ) -> Fit:
     """Fit parameters to a recording with any search; see ``World.fit`` and ``Search``."""
     world = world.for_fit(recording)
-    how = window, begins, setups, symmetric
+    how = window, begins, Reading(setups, columns, ignore), symmetric
     measured, targets = arguments_of(world, recording, as_names(parameters), *how)
     measured, later = (measured, None) if held_out is None else parted(measured, held_out)
     count, number = len(measured.cells[0]), len(targets)
     known = measured.given(noise)
     usual = (WINDOW, SHORT, WINDOW) if window is None else (window,)
-    searched = dict[int, Result]()
+    searched, outliers = dict[int, Result](), list[Outlier]()
     for attempt, rows in enumerate(usual, 1):
         with Shooting(world, measured, targets) as shooting:
             states = len(shooting.free)
@@ -78,12 +91,24 @@ def fit(
                 allowed = (f"at least {needed} measurements for {number} parameters",)
                 raise UnknownOption("recording", f"{count} measurements", allowed)
             minima = Minima(FitProblem(shooting, measured, targets, known, rows), search)
-            first = searched[rows] = searched.get(rows) or minima.found(range(number))
+            first = searched.get(rows) or minima.found(range(number))
+            for _ in range(0 if searched else PEELS):  # outliers hide others
+                problem, at = minima.problem, first.at if first.joined else first.first
+                windows = [*itertools.chain(*problem.windows)] if first.joined else problem.segments
+                new = problem.outliers(windows, at.scaled, at.starts)
+                if not new:
+                    break
+                outliers += new
+                minima = Minima(minima.problem.without(new), search)
+                first, measured = minima.found(range(number)), minima.problem.measured
+            searched[rows] = first
             if first.joined or attempt == len(usual):
                 found = fitted(minima, range(number), first, progress)
                 if attempt != 2 or max(found.misfit.values()) < CLEAR:
                     break
-    return dataclasses.replace(found, shortened=attempt == 2, later=later)
+    more = "" if found.explains else reading_of(world, measured)
+    about: dict[str, Any] = {"later": later, "outliers": tuple(outliers), "reading": more}
+    return dataclasses.replace(found, shortened=attempt == 2, **about)
 
 
 def arguments_of(
@@ -92,7 +117,7 @@ def arguments_of(
     parameters: Iterable[str] | None,
     window: int | None,
     begins: Begins = None,
-    setups: Sequence[Mapping[str, object]] | None = None,
+    reading: Reading | None = None,
     symmetric: bool = False,
 ) -> tuple[Measurements, tuple[Target, ...]]:
     """Check and read the arguments of a fit; all parameters that act on a measurement if None."""
@@ -105,7 +130,7 @@ def arguments_of(
         problem = f"the world is given {late} at a time, and a recording may begin at any"
         raise ModelError([f"{problem}: give values without a time"])
     with twin_of(world) as twin:
-        measured = read_recording(twin, recording, setups)
+        measured = read_recording(twin, recording, reading)
         asked = acting(twin, measured.columns) if parameters is None else parameters
         targets = targets_of(twin, asked, symmetric=symmetric)
         check_units(world, measured)

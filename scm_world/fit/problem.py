@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Any, NamedTuple, final
@@ -25,6 +25,10 @@ HALVINGS = 8  # of a distance to parameters that the world refuses
 STEPS = 30  # largest number of steps of a search
 LONGEST = 2.0  # largest scaled step of a number of a start state
 SEEN = 0.1  # least change of the measurements by a scaled unit of a start state that is fitted
+OUTLIER = 8.0  # robust standard deviations of a residual that no noise leaves
+MOST_OUTLIERS = 0.05  # largest share of them in a column
+BESIDE = 5  # rows in which the usual ones around an outlier are looked for
+ALONE = 0.7  # least distance from the line through these, in that to the fit
 MOST_RESIDUAL = 1e6  # in place of residuals after a lost state
 
 
@@ -34,6 +38,16 @@ class Window(NamedTuple):
     run: int
     first: int
     last: int
+
+
+class Outlier(NamedTuple):
+    """A measurement that was left out: its run, row, column, value, and distance to the fit."""
+
+    run: int
+    row: int
+    column: int
+    value: float
+    off: float
 
 
 class Simulated(NamedTuple):
@@ -48,6 +62,7 @@ class Simulator(ABC):
 
     Attributes:
         world: The simulated world, or None.
+        runs: The recorded runs.
         free: Places of the numbers of a state that are fitted, shape (k,).
         spans: Size of a scaled unit of each fitted number of a state, shape (k,).
         turned: Places of each unit quaternion in a state.
@@ -55,6 +70,7 @@ class Simulator(ABC):
     """
 
     world: Any = None
+    runs: Sequence[RecordedRun] = ()
     free: Integers
     spans: Floats
     turned: Sequence[slice] = ()
@@ -304,6 +320,68 @@ class FitProblem:
                     pass
                 steps[i] = 0.0
         return steps
+
+    def outliers(
+        self, windows: Sequence[Window], scaled: Floats, starts: Sequence[Floats]
+    ) -> list[Outlier]:
+        """Return single rows of a column that are far from the fit and from the line around them.
+
+        Far is ``OUTLIER`` robust standard deviations of the residuals of the column. Of a column
+        with many such rows none is an outlier: another model is needed. Where an impact came early
+        or late, a row is half as far from the line through the rows around it as from the fit.
+
+        Args:
+            windows: All windows or segments.
+            scaled: Scaled parameters, shape (p,).
+            starts: Their start states.
+
+        Source:
+            Rousseeuw and Leroy, *Robust Regression and Outlier Detection*, 1987, chapter 5.
+        """
+        run = np.concatenate(
+            [np.full(len(r.instants), i) for i, r in enumerate(self.simulator.runs)]
+        )
+        at = np.concatenate([np.arange(len(r.instants)) for r in self.simulator.runs])
+        row, column = self.measured.cells
+        made = self.simulator.simulate(
+            [(w, scaled, s) for w, s in zip(windows, starts, strict=True)]
+        )
+        plain, found = np.ones(len(self.measured.columns)), list[Outlier]()
+        pairs = zip(windows, made, strict=True)
+        every = np.concatenate([self.residual(w, one.values, plain) for w, one in pairs])
+        for c in range(len(self.measured.recorded)):
+            mine, left = row[column == c], every[column == c]
+            least = OUTLIER * max(float(np.median(np.abs(left))) / 0.6745, self.measured.least[c])
+            far = np.abs(left) > max(least, OUTLIER * self.noise[c] * self.known[c])
+            values, usual = self.measured.values[mine, c], np.flatnonzero(~far)
+            if not far.any() or far.mean() > MOST_OUTLIERS:
+                continue
+            for i in np.flatnonzero(far).tolist():
+                place = int(np.searchsorted(usual, i))
+                close = usual[max(place - 2, 0) : place + 2]
+                close = close[(np.abs(close - i) <= BESIDE) & (run[mine[close]] == run[mine[i]])]
+                near = close[np.argsort(np.abs(close - i), kind="stable")]
+                sides = near[near < i][:1].tolist() + near[near > i][:1].tolist()
+                one, other = sides if len(sides) == 2 else [*near[:2].tolist(), i, i][:2]
+                if i in (one, other):
+                    continue
+                share = (mine[i] - mine[one]) / (mine[other] - mine[one])
+                straight = values[one] + share * (values[other] - values[one])
+                if (values[i] - straight) / left[i] > ALONE:
+                    about = int(run[mine[i]]), int(at[mine[i]]), c
+                    found.append(Outlier(*about, float(values[i]), float(left[i])))
+        return found
+
+    def without(self, outliers: Sequence[Outlier]) -> FitProblem:
+        """Return the problem in which some measurements were not made."""
+        values = [run.values.copy() for run in self.measured.runs]
+        for one in outliers:
+            values[one.run][one.row, one.column] = np.nan
+        pairs = zip(self.measured.runs, values, strict=True)
+        measured = replace(self.measured, runs=tuple(replace(r, values=v) for r, v in pairs))
+        self.simulator.runs = measured.runs
+        noise = np.where(self.known, self.noise, np.nan)
+        return FitProblem(self.simulator, measured, self.targets, noise, self.window)
 
     def know(self, noise: Floats) -> None:
         """Take a noise as given."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, final
 import numpy as np
 
 from scm_world._arguments import real_number
-from scm_world._patterns import fits, fitting
+from scm_world._patterns import as_names, fits, fitting
 from scm_world._types import ArrayLike, Floats, Integers, Value
 from scm_world.errors import (
     ModelError,
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 
 TIME, EPISODE, SETUP, DO = "time", "episode", "do", "do."
 JITTER = 0.25  # of a control step: largest error of a time
+FRACTION = 0.01  # of a physics step, by which rows may be apart from whole ones
 DRIFT = 0.002  # largest relative error of a clock
 GAP = 1.5  # of the usual distance of rows: a longer one ends a run
 LONG = 500  # control steps from row to row, of which one of another unit of time has more
@@ -47,7 +49,7 @@ UNIT = 10.0  # of a range, which is soft: states that exceed it by more are in a
 TURN = 2.0 * np.pi
 
 KINDS = (
-    "the path of a .csv, .parquet or .npz file",
+    "the path of a .csv, .txt, .tsv, .parquet or .npz file",
     "a data frame",
     "arrays by name",
     "an Episode",
@@ -248,8 +250,37 @@ def settable_of(world: Simulation) -> dict[str, Variable]:
     return {n: v for n, v in variables.items() if v.is_root and v.settable and v.dtype == "real"}
 
 
+class Reading(NamedTuple):
+    """How recordings are read.
+
+    Attributes:
+        setups: The set-up of each of several recordings, if they do not have it.
+        columns: Names of this world by those of the tables.
+        ignore: Patterns of columns that are left out.
+    """
+
+    setups: Sequence[Mapping[str, object]] | None = None
+    columns: Mapping[str, str] | None = None
+    ignore: Iterable[str] = ()
+
+    def named(self, table: Any) -> Any:
+        """Return a table or arrays by name, with the names of this world."""
+        import pandas as pd
+
+        if not (self.columns or self.ignore) or not isinstance(table, Mapping | pd.DataFrame):
+            return table
+        columns, names = self.columns or {}, {str(name).strip(): name for name in table}
+        if missing := [name for name in columns if name not in names]:
+            raise UnknownOption("column of the table", missing[0], [*names])
+        ignore = as_names(self.ignore)
+        kept = {own: name for name, own in names.items() if not fits(name, ignore)}
+        if isinstance(table, Mapping):
+            return {columns.get(name, name): table[own] for own, name in kept.items()}
+        return table[[*kept]].rename(columns=lambda own: columns.get(kept[own], kept[own]))
+
+
 def read_recording(
-    world: Simulation, recording: Recording, setups: Sequence[Mapping[str, object]] | None = None
+    world: Simulation, recording: Recording, how: Reading | None = None
 ) -> Measurements:
     """Read a recording.
 
@@ -260,21 +291,25 @@ def read_recording(
         world: The model of the recorded system, which defines the control step and the meaning of
             the columns.
         recording: See ``World.fit``.
-        setups: The set-up of each of several recordings, if they do not have it.
+        how: How to read it.
 
     Raises:
-        UnknownOption: The recording is of another kind, or has another number of set-ups.
+        UnknownOption: The recording is of another kind, has another number of set-ups, or lacks a
+            column that is renamed.
         ModelError: The tables have faults; see ``World.fit``.
         UnreadableFile: A file cannot be read.
     """
     known = columns_of(world)
     frames: list[tuple[str, pd.DataFrame, bool]] = []
     every = [*recording] if isinstance(recording, list | tuple) else [recording]
-    if setups is not None and len(setups) != len(every):
+    how = how or Reading()
+    setups = [{}] * len(every) if how.setups is None else how.setups
+    if len(setups) != len(every):
         raise UnknownOption("setups", f"{len(setups)} set-ups", (f"{len(every)}, one of each",))
-    for number, one in enumerate(every, 1):
+    for number, (one, setup) in enumerate(zip(every, setups, strict=True), 1):
         label = f"run {number}" if one is not recording else ""
-        frames += _frames(world, one, label, {} if setups is None else setups[number - 1])
+        label, table = (str(one), _file(one)) if isinstance(one, str | Path) else (label, one)
+        frames += _frames(world, how.named(table), label, setup)
     if not frames:
         raise UnknownOption("recording", recording, ("one or more runs",))
     for label, frame, _ in frames:
@@ -446,7 +481,9 @@ def _file(path: str | Path) -> pd.DataFrame | dict[str, Value]:
 
     place = located(path)
     readers: dict[str, Callable[[bytes], pd.DataFrame | dict[str, Value]]] = {
-        ".csv": lambda data: pd.read_csv(io.BytesIO(data), skipinitialspace=True),
+        ".csv": _separated,
+        ".txt": _separated,
+        ".tsv": _separated,
         ".parquet": lambda data: pd.read_parquet(io.BytesIO(data)),
         ".npz": read_arrays,
     }
@@ -463,6 +500,30 @@ def _file(path: str | Path) -> pd.DataFrame | dict[str, Value]:
             raise
         advice = "give a table with a column of the time and one for each command and measurement"
         raise UnreadableFile(str(path), in_one_line(error), advice) from error
+
+
+def _separated(data: bytes) -> pd.DataFrame:
+    """Read a table of text: commas, semicolons or tabs, comments, decimal commas.
+
+    Lines that begin with # or % are comments; the last one before the numbers names the columns if
+    no other line does.
+    """
+    import pandas as pd
+
+    lines = [line for line in data.decode("utf-8-sig").splitlines() if line.strip(" \t,;")]
+    comments = [line for line in lines if line.lstrip()[0] in "#%"]
+    rows = [line for line in lines if line.lstrip()[0] not in "#%"]
+    if rows and comments and not re.search("[A-Za-z]", rows[0]):
+        rows = [comments[-1].lstrip(" #%\t"), *rows]
+    separator = next((one for one in ";\t," if one in (rows or [""])[0]), r"\s+")
+    commas = separator != "," and any("," in line for line in rows[1:])
+    how: dict[str, Any] = {
+        "sep": separator,
+        "decimal": "," if commas else ".",
+        "skipinitialspace": True,
+    }
+    frame: pd.DataFrame = pd.read_csv(io.StringIO("\n".join(rows)), **how)
+    return frame
 
 
 def _framed(arrays: Mapping[str, ArrayLike]) -> pd.DataFrame:
@@ -525,7 +586,8 @@ def _faults(world: Simulation, frame: pd.DataFrame) -> Iterator[str]:
     own = commands_of(world).values()
     if TIME not in names:
         found = ", ".join(names)
-        yield f"there is no column 'time' [s] in a table (in CSV, with commas) of {found}"
+        advice = "name one by columns={'stamp': 'time'}, and leave others out by ignore="
+        yield f"there is no column 'time' [s] in a table of {found}: {advice}"
         return
     if len(frame) < 2:
         yield f"a run has two rows or more, got {len(frame)}"
@@ -611,6 +673,10 @@ def _runs(
         if not repeats.all() or apart.max() > JITTER:
             said = f"times are not whole control steps of {dt:g} s, by row {rows[apart.argmax()]}"
             said += f": rows are usually {usual:.4g} s apart: give the world control_dt={usual:.4g}"
+            unit = getattr(world.task, "time_unit", dt)
+            if abs(usual / unit - round(usual / unit)) > FRACTION:
+                said += ", and its file a physics step that divides it, such as "
+                said += f"timestep={usual / np.ceil(usual / unit):.6g}"
             _refuse([f"{said}, or resample the recording"], label)
         if np.isfinite(values[rows]).any():
             commands = np.repeat(np.clip(sent[rows[:-1]], low, high), repeats, axis=0)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
@@ -19,6 +20,7 @@ from scm_world.fit.problem import (
     SHORT,
     WINDOW,
     LinearWindow,
+    Outlier,
     by_column,
     degrees,
     projected,
@@ -30,17 +32,20 @@ from scm_world.fit.recordings import (
     Limits,
     MeasuredNumber,
     Measurements,
+    Reading,
     RecordedRun,
     at_rest,
     columns_of,
     read_recording,
 )
+from scm_world.fit.saving import saved
 from scm_world.fit.shooting import Shooting
 from scm_world.fit.targets import (
     FAR,
     Target,
     delays_of,
     free_states,
+    posterior_of,
     ranges_of,
     twin_of,
     values_of,
@@ -49,7 +54,7 @@ from scm_world.geometry.rotations import aligned
 from scm_world.queries.world import World
 from scm_world.runs.canvas import PALETTE, blank, styled
 from scm_world.tasks.model import ModelTask
-from scm_world.variables.interventions import has_times
+from scm_world.variables.interventions import Mechanism, has_times
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -61,6 +66,7 @@ DETERMINED = 0.25  # largest standard error of a determined combination: a share
 MISFIT = 1.5  # least residual that the noise does not explain, in standard deviations of it
 AWAY = 0.5  # of the spread of a state in the recording, at which it is far from rest
 WORSE = 1.1  # times the error of the unfitted world, with which a fit replays worse than it
+SHOWN = 5  # outliers that are named
 MAIN = 0.3  # least share of a parameter in a combination that is named
 DRAWN = 8  # columns of a picture
 
@@ -86,6 +92,8 @@ class Fit:
         ended: Whether the search took all its steps before it found a minimum.
         played: See ``replay``, of the fit and the unfitted world, (2, columns).
         later: The rows that were held out.
+        outliers: Measurements that were left out: no noise of the others leaves them.
+        reading: Another reading of one column that the world follows far better, in words.
 
     Example:
         >>> from scm_world.queries import World
@@ -115,6 +123,8 @@ class Fit:
     ended: bool = False
     played: Floats | None = None
     later: Measurements | None = None
+    outliers: tuple[Outlier, ...] = ()
+    reading: str = ""
 
     @property
     def runs(self) -> tuple[RecordedRun, ...]:
@@ -416,7 +426,14 @@ class Fit:
         return unfitted < min(1.0, fit / WORSE)
 
     @typed
-    def predict(self, recording: object, *, ahead: float | None = None) -> Prediction:
+    def predict(
+        self,
+        recording: object,
+        *,
+        ahead: float | None = None,
+        columns: Mapping[str, str] | None = None,
+        ignore: Iterable[str] = (),
+    ) -> Prediction:
         """Predict another recording, beside the world that was asked and a constant.
 
         It is cut into windows that do not overlap. The fitted and the unfitted world each begin
@@ -425,13 +442,46 @@ class Fit:
         Args:
             recording: The recording, of the kinds of ``World.fit``.
             ahead: How far to predict [s]; 40 rows if None, or as a window of the fit.
+            columns: See ``World.fit``.
+            ignore: See ``World.fit``.
 
         Raises:
             UnknownOption: No window has a row to predict.
             ModelError: The recording has faults.
         """
         with twin_of(self.asked) as twin:
-            return predicted(self, read_recording(twin, recording), ahead)
+            how = Reading(None, columns, ignore)
+            return predicted(self, read_recording(twin, recording, how), ahead)
+
+    @property
+    def spread(self) -> Floats:
+        """Covariance of the scaled parameters, with a wide prior where nothing is known, (p, p)."""
+        return spread_of(self.sensitivities / np.sqrt(self.discount))
+
+    def posterior(self) -> dict[str, Mechanism]:
+        """Return what the recording leaves open as an intervention that draws the parameters.
+
+        They are drawn together, from the normal distribution of the scaled parameters that
+        ``counterfactual`` uses, within their ranges: ``start=fit.posterior()`` of an environment
+        randomises by what was not determined. A delay is not among them.
+        """
+        return posterior_of(self.targets, self.scaled, self.spread)
+
+    def save(self, path: str | Path) -> None:
+        """Write the fit to a file, as its ending says.
+
+        ``.xml`` and ``.urdf`` are the file that the world was made from, with the fitted numbers;
+        all else of it stays, comments too. It is read again before it is written, and all
+        parameters are compared. A delay is no part of it. ``.yaml`` has the values with their
+        intervals, the remarks and the replay. ``.html`` is a page with tables and
+        traces.
+
+        Raises:
+            UnknownOption: The file has another ending.
+            ModelError: The world was not made from a file, or a parameter is defined elsewhere than
+                in its own element, so that it cannot be written there; nothing is written.
+        """
+        saved(self, Path(path))
 
     @cached_property
     def held_out(self) -> Prediction | None:
@@ -474,6 +524,18 @@ class Fit:
             f"no experiment of this model seems to determine {name}: it changes {tried}"
             for name in self.unseen
         ]
+        for run, row, column, value, off in sorted(self.outliers, key=lambda o: -abs(o.off))[
+            :SHOWN
+        ]:
+            time = self.runs[run].begin + self.measured.control_dt * self.runs[run].instants[row]
+            where = f"row {row}" + f" of run {run}" * (len(self.runs) > 1) + f" ({time:.4g} s)"
+            found.append(
+                f"{self.columns[column].name} = {value:.4g} in {where} is {off:.3g} from "
+                f"the fit, {abs(off) / self.noise[column]:.3g} times the noise: it was left out"
+            )
+        if len(self.outliers) > SHOWN:
+            found.append(f"{len(self.outliers)} measurements were left out; fit.outliers has all")
+        found += [self.reading] * bool(self.reading)
         groups = [tuple(n for n in names if n not in self.unseen) for names in self.confounded]
         if self.worse:
             found.append(
@@ -580,11 +642,11 @@ class Fit:
         longest = max(len(run.commands) for run in self.runs)
         count = longest if steps is None else steps
         known = self.sensitivities / np.sqrt(self.discount)
-        how: Any = {"steps": count, "limits": limits, "seed": seed, "setups": setups}
+        how: dict[str, Any] = {"steps": count, "limits": limits, "seed": seed, "setups": setups}
         return suggested(self, known, n, **how)
 
     def counterfactual(
-        self, do: Mapping[str, object], *, at: int = 0, run: int = 0, draws: int = 32, seed: int = 0
+        self, do: Mapping[str, object], *, at: int = 0, run: int = 0, draws: int = 40, seed: int = 0
     ) -> pd.DataFrame:
         """Return the measurements of a recorded run as they would be under an intervention.
 
@@ -592,8 +654,8 @@ class Fit:
         between the start state of a window and the end of the window before come from causes that
         are not modelled. Both are added again, so that no intervention gives the recorded
         measurements. The interval is that of the parameters, which are drawn from
-        the covariance of the fit (from its prior where the recording determines nothing) with
-        their start states.
+        the covariance of the fit (from its prior where the recording determines nothing), and of
+        the start states, which are drawn given these. Ends are quantiles k : (n + 1) of n draws.
 
         Args:
             do: The intervention, without times: parameters from then on, states at that instant,
@@ -619,26 +681,34 @@ class Fit:
         if has_times(do):
             raise UnknownOption("do", do, ("interventions without a time: at= says when",))
         rng = np.random.default_rng(whole_number("seed", seed, least=0))
-        along = self.sensitivities / np.sqrt(self.discount)
-        spread = spread_of(along)
         away = rng.multivariate_normal(
-            np.zeros(len(self.scaled)), spread, whole_number("draws", draws, least=2)
+            np.zeros(len(self.scaled)), self.spread, whole_number("draws", draws, least=2)
         )
-        scaled = np.vstack([self.scaled, np.clip(self.scaled + away, *ranges_of(self.targets))])
+        size = np.sqrt(self.degrees / rng.chisquare(self.degrees, (draws, 1)))  # Student's t
+        away = self.scaled + size * away
+        scaled = np.vstack([self.scaled, np.clip(away, *ranges_of(self.targets))])
         windows = windows_of(self.runs, self.window)
         mine = [w for w, one in enumerate(windows) if one.run == run]
+        errors = dict[int, Floats]()  # of start states, given the parameters
+        for w in mine:
+            _, sizes, right = self.found[w].fitted
+            free = size * rng.normal(size=(draws, len(sizes))) * np.sqrt(self.discount) / sizes
+            errors[w] = np.vstack([np.zeros(right.shape[1]), free @ right])
         with Shooting(self.asked, self.measured, self.targets) as shooting:
             shooting.spans, moved = self.spans, shooting.moved
             starts = [
-                [moved(self.starts[w], self.found[w].slopes @ (one - self.scaled)) for w in mine]
-                for one in scaled
+                [
+                    moved(self.starts[w], self.found[w].slopes @ (one - self.scaled) + errors[w][i])
+                    for w in mine
+                ]
+                for i, one in enumerate(scaled)
             ]
             which = [windows[w] for w in mine]
             plain, other = shooting.replay(which, scaled, np.array(starts), do, at)
             plain = aligned(plain, recorded.values, shooting.rotations)
             found = recorded.values + aligned(other, plain, shooting.rotations) - plain
         tails = 0.5 * (1.0 - CONFIDENCE)
-        ends = np.quantile(found[1:], (tails, 1.0 - tails), axis=0)
+        ends = np.quantile(found[1:], (tails, 1.0 - tails), axis=0, method="weibull")
         time = recorded.begin + self.measured.control_dt * recorded.instants
         names = [column.name for column in self.measured.recorded]
         about = {"time": np.tile(time, len(names)), "column": np.repeat(names, len(time))}

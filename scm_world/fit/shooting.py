@@ -61,7 +61,8 @@ class Shooting(Simulator):
     """
 
     def __init__(self, world: World, measured: Measurements, targets: Sequence[Target]) -> None:
-        world.require_exact("a fit, whose sensitivities are differences of paired runs,")
+        what = "a fit, whose sensitivities are differences of paired runs,"
+        world.require_exact(what, independent=True)
         self.world, self.runs, self.columns = world, measured.runs, measured.columns
         self.targets, self._open = tuple(targets), ExitStack()
         self._names = tuple(dict.fromkeys(c.variable for c in measured.recorded))
@@ -371,7 +372,7 @@ class Shooting(Simulator):
                 self._batch.advance(now, going, within)
             if before is not None:
                 before(step)
-            for table, rows in self._batch._by_structure(np.flatnonzero(going)):
+            for table, rows in self._batch.by_structure(np.flatnonzero(going)):
                 seen[step, rows] = table.numbers[np.ix_(rows, self._places)]
         return seen
 

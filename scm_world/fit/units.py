@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from scm_world._types import Floats, Integers
 from scm_world.errors import ModelError
 from scm_world.fit.problem import Window, segments_of, windows_of
-from scm_world.fit.recordings import MeasuredNumber, Measurements, RecordedRun
+from scm_world.fit.recordings import MeasuredNumber, Measurements, RecordedRun, commands_of
 from scm_world.fit.shooting import SPEEDS, Shooting
 from scm_world.fit.targets import twin_of
 from scm_world.geometry.rotations import aligned, angle_between
@@ -24,29 +25,37 @@ POOR = 0.7  # least share of the motion that is not simulated, if a reading is d
 BETTER = 0.7  # largest share in another reading, relative to that
 TURNED = 0.3  # the same of quaternions, which have no scale that would tell
 BEGINNING = 0.95  # the same, if they begin at the default orientation in the other reading only
+TEN = 10.0  # times less of the motion is not simulated with another factor that is named
 NEAR, AWAY = 0.5, 2.0  # [rad] from the default orientation in the other reading, and as they are
 
 
 class _Reading(NamedTuple):
-    """Some columns: angles in degrees, or else a quaternion with w first.
+    """Some columns: angles in degrees, a quaternion with w first, or numbers times a factor.
 
     Attributes:
-        places: Numbers of the columns.
+        places: Numbers of the columns; none for a command.
         angles: Columns that may jump by a turn.
         quaternion: Whether the columns are a quaternion.
+        factor: By which the columns, or the command, are multiplied.
+        command: Number of a command.
     """
 
     places: Integers
     angles: Integers
-    quaternion: bool
+    quaternion: bool = False
+    factor: float = np.pi / 180.0
+    command: int | None = None
 
     def converted(self, run: RecordedRun) -> RecordedRun:
-        """Return a run in radians, or with quaternions x, y, z, w."""
-        values = run.values.copy()
+        """Return a run in radians, with quaternions x, y, z, w, or with multiplied numbers."""
+        values, commands = run.values.copy(), run.commands.copy()
+        if self.command is not None:
+            commands[:, self.command] *= self.factor
+            return replace(run, commands=commands)
         if self.quaternion:
             values[:, self.places] = values[:, np.roll(self.places, -1)]
             return replace(run, values=values)
-        values[:, self.places] = np.deg2rad(values[:, self.places])
+        values[:, self.places] *= self.factor
         for cells in (values[:, i] for i in self.angles):
             seen = np.isfinite(cells)
             cells[seen] = np.unwrap(cells[seen])
@@ -69,10 +78,7 @@ def check_units(world: World, measured: Measurements) -> None:
     Raises:
         ModelError: Columns are in degrees, or an orientation is not in the order x, y, z, w.
     """
-    runs, columns = measured.runs, measured.columns
-    segments = [s for one in windows_of(runs, None) for s in segments_of(one)]
-    segments = [one for one in segments if one.last - one.first >= FEWEST]
-    segments = segments[:: -(-len(segments) // SEGMENTS)] if segments else []
+    runs, columns, segments = measured.runs, measured.columns, _segments(measured)
     angles = np.array([c.unit in ("rad", "rad/s") for c in columns])
     quaternions = any(c.component == 3 for c in columns)
     if not segments or not (angles.any() or quaternions):
@@ -96,6 +102,48 @@ def check_units(world: World, measured: Measurements) -> None:
         _refuse([columns[i] for i in reading.places], reading.quaternion, before, after)
 
 
+def reading_of(world: World, measured: Measurements) -> str:
+    """Return which factor on one column or command makes the world follow the recording, in words.
+
+    The factors are those of signs, units and gears. It is empty where none leaves a tenth of the
+    motion that is not simulated, or less.
+    """
+    segments, none = _segments(measured), np.zeros(0, int)
+    if not segments:
+        return ""
+    with twin_of(world) as twin:
+        names = [*commands_of(twin)]
+        stems = [name.rpartition(".")[0] for name in names]
+        gears = [
+            float(np.ravel(twin[n])[0]) for n in (f"{s}.gear" for s in stems) if n in twin.model
+        ]
+    factors = {"-1": -1.0, "1000": 1000.0, "1/1000": 1e-3, "180/pi": 180.0 / np.pi}
+    factors["pi/180"] = np.pi / 180.0
+    for gear in {*gears} - {0.0, 1.0, -1.0}:
+        factors |= {f"1/gear = {1.0 / gear:g}": 1.0 / gear, f"gear = {gear:g}": gear}
+    every: list[tuple[str, Any]] = [
+        (c.name, {"places": np.array([i])}) for i, c in enumerate(measured.recorded)
+    ]
+    every += [(name, {"places": none, "command": i}) for i, name in enumerate(names)]
+    found = []
+    with Shooting(world, measured, ()) as shooting:
+        before = _compared(shooting, segments).size
+        for (name, what), (words, factor) in itertools.product(every, factors.items()):
+            reading = _Reading(angles=none, factor=factor, **what)
+            shooting.runs = tuple(map(reading.converted, measured.runs))
+            found.append((_compared(shooting, segments).size, name, words))
+    after, name, words = min(found)
+    said = f"{name} times {words} leaves {after / before:.2g} of the motion that the world does "
+    return f"{said}not follow as it is: check its unit and its sign" if TEN * after < before else ""
+
+
+def _segments(measured: Measurements) -> list[Window]:
+    """Return some short segments of a recording."""
+    segments = [s for one in windows_of(measured.runs, None) for s in segments_of(one)]
+    segments = [one for one in segments if one.last - one.first >= FEWEST]
+    return segments[:: -(-len(segments) // SEGMENTS)] if segments else []
+
+
 def _readings(
     columns: Sequence[MeasuredNumber], angles: Floats, rotations: Sequence[Integers]
 ) -> Iterator[_Reading]:
@@ -105,7 +153,7 @@ def _readings(
     kinds += [*every[angles]] if angles.sum() <= ALONE else []
     for kind in kinds:
         if kind.any():
-            yield _Reading(np.flatnonzero(kind), np.flatnonzero(kind & ~speeds), False)
+            yield _Reading(np.flatnonzero(kind), np.flatnonzero(kind & ~speeds))
     yield from (_Reading(places, places[:0], True) for places in rotations)
 
 
@@ -118,6 +166,11 @@ class _Compared(NamedTuple):
     def share(self, places: Integers) -> float:
         """Return the share of the motion of some columns that is not simulated."""
         return float(self.left[places].sum() / max(self.whole[places].sum(), 1e-300))
+
+    @property
+    def size(self) -> float:
+        """The sum of the shares of all columns."""
+        return float((self.left / np.maximum(self.whole, 1e-300)).sum())
 
     @property
     def total(self) -> float:

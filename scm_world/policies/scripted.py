@@ -8,13 +8,16 @@ from functools import cache
 from typing import Any, Protocol, final, runtime_checkable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scm_world._arguments import real_number, real_numbers, typed, whole_number
 from scm_world._types import ArrayLike, Floats
 from scm_world.errors import ActionError
 from scm_world.policies.planning import CrossEntropy, action_range
 from scm_world.tasks import TASKS
+from scm_world.variables.distributions import word_of
 from scm_world.world import CausalSystem
+from scm_world.world.philox import uniforms
 
 Policy = Callable[[Any], ArrayLike]
 """Looks at a world and gives an action, shape (n_actions,) in the units of its action mode."""
@@ -22,7 +25,10 @@ Policy = Callable[[Any], ArrayLike]
 
 @runtime_checkable
 class OpenLoopPolicy(Protocol):
-    """A policy that ignores the state: all its actions are known beforehand."""
+    """A policy that ignores the state: all its actions are known beforehand.
+
+    One that reads no world either may have a method ``together``, as ``Random`` has it.
+    """
 
     def ahead(self, world: CausalSystem, first: int, count: int) -> Floats:
         """Return the actions of some control steps, shape (count, n_actions).
@@ -62,11 +68,27 @@ class Random(OpenLoopPolicy):
 
     def ahead(self, world: CausalSystem, first: int, count: int) -> Floats:
         """Draw the actions of some control steps."""
-        n, noise, episode = world.compiled.n_actions, world.noise, world.episode
-        drawn = np.empty((count, n))
-        for row, index in enumerate(range(first, first + count)):
-            step = index // self.every
-            drawn[row] = noise.uniforms("policy", n=n, episode=episode, step=step)[0]
+        episode = np.array([[world.noise.key, world.episode]], dtype=np.uint64)
+        found: Floats = self.together(world, episode, first, count)[0]
+        return found
+
+    def together(
+        self, world: CausalSystem, episodes: NDArray[np.uint64], first: int, count: int
+    ) -> Floats:
+        """Draw the actions of several episodes, shape (n, count, n_actions).
+
+        Args:
+            world: One with these actions.
+            episodes: The key of the noise and the number of each, shape (n, 2).
+            first: The first control step.
+            count: Number of control steps.
+        """
+        where = np.empty((len(episodes), count, 3), dtype=np.uint64)
+        where[..., :2] = episodes[:, None]
+        where[..., 2] = np.arange(first, first + count) // self.every
+        word = np.array([word_of("policy")], dtype=np.uint64)
+        n = world.compiled.n_actions
+        drawn = uniforms(where.reshape(-1, 3), word, n).reshape(len(episodes), count, n)
         low, high = action_range(world)
         middle, half = 0.5 * (low + high), 0.5 * (high - low)
         half = half + 0.5 * world.compiled.whole  # each of them is as likely, once it is rounded
@@ -106,6 +128,10 @@ class Sequence(OpenLoopPolicy):
         rows = np.arange(first, first + count)
         found: Floats = self.actions[np.minimum(rows, len(self.actions) - 1)]
         return found
+
+    def together(self, world: CausalSystem, episodes: Any, first: int, count: int) -> Floats:
+        """Return the same actions for several episodes; see ``Random.together``."""
+        return np.repeat(self.ahead(world, first, count)[None], len(episodes), axis=0)
 
 
 FREE: Mapping[str, Callable[[], Policy]] = {"random": Random}

@@ -178,7 +178,8 @@ def consequences(
     Raises:
         UnknownOption: The space does not exist.
         InterventionError: The intervention is refused.
-        InexactEngine: Equal runs differ on the engine.
+        InexactEngine: Equal runs differ on the engine, or bodies that do not touch change one
+            another.
 
     Example:
         >>> found = consequences(World("pushing", backend="fake"), {"tool_block.mass": 0.05})
@@ -194,7 +195,8 @@ def consequences(
         raise UnknownOption("request", request, ("interventions without a time",))
     steps = whole_number("steps", steps, least=0, most=MANY) if system.graph.is_temporal else 0
     twins, unit = asked(system)[0], Unit(seed, 0, system.planned(None), None, steps, (ALL,))
-    twins.require_exact("a comparison of an episode with and without an intervention")
+    what = "a comparison of an episode with and without an intervention"
+    twins.require_exact(what, independent=True)
     with twins.twin() as world:
         plain = unit.run(world, twins)
         if space is not None:
@@ -263,10 +265,13 @@ def but_for(
     Raises:
         UnknownOption: A cause without alternative value was not intervened on, or an argument is
             invalid.
+        InexactEngine: Equal runs differ on the engine, or bodies that do not touch change one
+            another.
     """
     import pandas as pd
 
     _check_episode(episode)
+    episode.twins.require_exact("whether a cause mattered", independent=True)
     most, at = whole_number("most", most, least=1), whole_number("at", at, least=0)
     if isinstance(over, Mapping):
         contrasts = dict(over)

@@ -62,6 +62,7 @@ class Unit:
     start: Snapshot | None = (
         None  # snapshot at that instant, before interventions; None for a new episode
     )
+    ends: bool = False  # whether the names are recorded at the first and last instants only
     listens: bool = False  # whether to record contacts in every physics step, which is slower
 
     def run(self, world: CausalSystem, twins: Twins | None = None) -> Episode:
@@ -153,6 +154,7 @@ class Episode:
     values: dict[str, list[Value]] = field(default_factory=dict)
     touching: list[Pairs] = field(default_factory=list)
     touched: list[Pairs] = field(default_factory=list)
+    remembers: bool = field(default=True, init=False)  # whether the memory is complete
     _policy: Any = field(default=None, init=False)
     _version: int = field(default=-1, init=False)
     _lease: ExitStack = field(default_factory=ExitStack, init=False)
@@ -193,12 +195,18 @@ class Episode:
             eras=[era for era in self.eras if era.step < step],
             taken=self.taken[:step],
             snapshots=before(self.snapshots),
-            memory=self.memory.until(step),
+            memory=self._remembered().until(step),
             audits=before(self.audits),
             values={name: values[:step] for name, values in self.values.items()},
             touching=[],
             touched=[],
         )
+
+    def _remembered(self) -> Memory:
+        """Return what its plan has to know of its past; one that ran with others runs again."""
+        if not self.remembers:
+            self.memory, self.remembers = self.twins.episode(self._again()).memory, True
+        return self.memory
 
     def __getstate__(self) -> dict[str, Any]:
         if self.world is not None:
@@ -238,7 +246,7 @@ class Episode:
             statics = {name: np.array(now[name]) for name in world.static_names}
             self.eras.append(Era(step, world.compiled, statics))
         self.vectors.append(world.vector.copy())
-        if names:
+        if names and not (self.unit.ends and 0 < step < self.unit.steps):
             there = tuple(name for name in names if name in world.model)
             found = world.row if ready else world.evaluate(None if names == (ALL,) else there)
             for name in world.model if names == (ALL,) else there:
@@ -453,10 +461,10 @@ class Episode:
         if not isinstance(name, str):
             raise UnknownVariable(name, self.names)
         if name in self.values:
-            return np.array(self.values[name])
+            return np.asarray(self.values[name])
         first = self.eras[0].compiled
         if name in first.slices and all(era.compiled.plan == first.plan for era in self.eras):
-            return np.asarray(first.read(name, np.array(self.vectors)))
+            return np.asarray(first.read(name, np.asarray(self.vectors)))
         if all(name in era.statics for era in self.eras):
             steps = [era.step for era in self.eras] + [len(self.vectors)]
             return np.repeat([era.statics[name] for era in self.eras], np.diff(steps), axis=0)
@@ -572,7 +580,7 @@ class Episode:
         if not isinstance(actions, str) or actions != "replay":
             unit = replace(unit, policy=actions)
         units = self._branches(unit, at, dos)
-        return tuple(self.twins.run(units, lambda other: other, workers)) if units else ()
+        return tuple(self.twins.run(units, tuple, workers)) if units else ()
 
     def _again(self) -> Unit:
         """Return the unit that repeats this episode."""
@@ -594,7 +602,7 @@ class Episode:
         near = max((step for step in self.snapshots if step < at), default=None)
         with self.twins.twin() as world:
             running = Episode._of(None, replace(self._again(), steps=at), world)
-            running.memory = self.memory.until(at)
+            running.memory = self._remembered().until(at)
             if near is None:
                 running._begin()
             else:

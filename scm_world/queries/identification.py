@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
 import networkx as nx
 import numpy as np
@@ -19,6 +19,9 @@ from scm_world.graph.views import projection, to_dag
 from scm_world.queries.plans import Plan, at_once
 from scm_world.variables import Intervention
 from scm_world.world import CausalSystem
+
+if TYPE_CHECKING:
+    import pandas
 
 
 @final
@@ -281,10 +284,10 @@ DETERMINED = 1e-9
 @typed
 def estimate(
     found: Identification,
-    table: Any,
+    table: pandas.DataFrame,
     *,
-    do: Any,
-    versus: Any,
+    do: object,
+    versus: object,
     method: str | None = None,
     method_params: Mapping[str, Any] | None = None,
 ) -> Any:
@@ -346,8 +349,9 @@ def estimate(
         data = data.assign(**{treatment: data[treatment] == do})
     else:
         _check_varies(data, treatment, [n for n in others if way != "iv" and n not in labels])
-        counted = data[treatment].astype(float) - float(versus)
-        data = data.assign(**{treatment: counted / (float(do) - float(versus))})
+        high, low = (float(np.asarray(value)) for value in (do, versus))
+        counted = data[treatment].astype(float) - low
+        data = data.assign(**{treatment: counted / (high - low)})
     graph = nx.DiGraph([(treatment, outcome)])  # of the criterion: the table has no other nodes
     if way == "backdoor":
         graph.add_edges_from((name, end) for name in others for end in (treatment, outcome))
@@ -377,7 +381,7 @@ def estimate(
         )
 
 
-def _columns(table: Any, names: Sequence[str]) -> tuple[Any, list[str]]:
+def _columns(table: pandas.DataFrame, names: Sequence[str]) -> tuple[Any, list[str]]:
     """Return columns of a data frame, and which of them have labels, or refuse the table."""
     for name in names:
         one_of("column of the table", name, tuple(map(str, table.columns)))
@@ -389,7 +393,7 @@ def _columns(table: Any, names: Sequence[str]) -> tuple[Any, list[str]]:
     return data, [name for name in names if data[name].dtype.kind not in "biuf"]
 
 
-def _check_values(column: Any, has_labels: bool, **values: Any) -> None:
+def _check_values(column: pandas.Series[Any], has_labels: bool, **values: object) -> None:
     """Refuse values of the treatment that are not labels of its column, or not numbers."""
     for option, value in values.items():
         if has_labels:
@@ -398,7 +402,7 @@ def _check_values(column: Any, has_labels: bool, **values: Any) -> None:
             real_number(option, value)
 
 
-def _check_varies(data: Any, name: str, given: list[str]) -> None:
+def _check_varies(data: pandas.DataFrame, name: str, given: list[str]) -> None:
     """Refuse a column that has one value, or is a linear function of the given ones."""
     values, known = data[name].to_numpy(float), data[given].to_numpy(float)
     known = np.column_stack([known, np.ones(len(data))])

@@ -33,6 +33,7 @@ from scm_world.variables import (
 )
 from scm_world.variables.kinds import SPACES
 from scm_world.variables.mechanisms import check_portable, check_trusted
+from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.world import Audit, CausalSystem, Simulation
 from scm_world.world.interventions import Level
 
@@ -385,6 +386,42 @@ class Plan(Mapping[str, tuple[Intervention, ...]]):
         audit = do(request) if level is None else do(request, levels=levels)
         self._keep_draws(simulation, step, chains, memory)
         return audit
+
+    def _asked_of_all(self, world: Simulation, steps: int) -> dict[int, dict[str, Any]] | None:
+        """Return what is asked for at each instant of episodes that begin alike, by instant.
+
+        None if that depends on the episode: on an event, on what was drawn in it before, on what
+        the context draws whatever is asked, or on its structure or clock.
+
+        Args:
+            world: One in which the episodes begin.
+            steps: Number of control steps.
+        """
+        compiled, memory, found = world.compiled, Memory(), dict[int, dict[str, Any]]()
+        times = [act.time for _, act in self.timed()]
+        if any(time.when is not None for time in times):
+            return None
+        apart = {*compiled.composition.structural, *world.deciding, CONTROL_INDEX}
+        for step in range(max(steps, 1) if times else 1):
+            try:
+                forces, moved = self._moved(world, step, memory)
+                chains = _chains(world, step, forces, moved)
+                context = [force for force in forces if force.layer != OWN]
+                levels = context if len(context) < len(forces) else []
+                if moved and _level(world, step, levels, moved, memory) is not None:
+                    return None
+                request = _requests(world, moved, chains, memory)
+                for name, act in request.items():
+                    world.model.accept(name, act)
+                names = {*chains, *compiled.static_order(tuple(chains))}
+            except InterventionError:  # which is that of each episode
+                return None
+            drawn = (one for chain in chains.values() for one in chain if one.act.has_draw)
+            if any(one.start < step for one in drawn) or not apart.isdisjoint(names):
+                return None
+            if moved:
+                found[step] = request
+        return found
 
     def _due(self, world: CausalSystem, step: int, memory: Memory) -> dict[str, Intervention]:
         """Return the interventions at the beginning of a control step, without times.

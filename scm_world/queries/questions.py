@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain, count
 from typing import TYPE_CHECKING, Any, Self, final
@@ -26,16 +26,16 @@ from scm_world.queries.samples import (
     Samples,
     Setting,
     alike,
-    as_numbers,
     as_outcome,
     as_outcomes,
     column,
     effect_of,
     is_category,
-    read,
+    read_each,
     refuse_late,
     usual_outcomes,
 )
+from scm_world.queries.together import Episodes
 from scm_world.queries.twins import Twins, asked
 from scm_world.variables import Variable
 from scm_world.world import CausalSystem, CompiledModel, Equations
@@ -193,33 +193,23 @@ class Questions:
         if each:
             units = [replace(u, plan=u.plan.do(more)) for u, more in zip(units, each, strict=True)]
 
-        # Outcomes of equations are computed for all units together:
-        model = twins.model if all(isinstance(one, Outcome) for one in wanted) else None
         done = count(1)
 
-        def outcomes_of(episode: Episode) -> list[Floats]:
-            return [read(one, episode) for one in wanted]
+        def outcomes_of(episodes: Episodes) -> Iterator[tuple[Floats, ...]]:
+            return zip(*(read_each(one, episodes) for one in wanted), strict=True)
 
-        def finish(episode: Episode) -> Any:
-            row: Any = np.array(episode.vectors) if model else outcomes_of(episode)
-            if progress is not None:
-                progress(next(done), n)
-            return row
+        def finish(episodes: Episodes) -> Iterator[tuple[Floats, ...]]:
+            for row in outcomes_of(episodes):
+                yield row
+                if progress is not None:
+                    progress(next(done), n)
 
         rows = twins.run(units, finish, setting.workers)
-        if model is not None:
-            vectors = np.array(rows)
-            found = [
-                as_numbers(o._of_many(model.read(o.name, vectors), o.name in model.decided), o)
-                for o in wanted
-                if isinstance(o, Outcome)
-            ]
-        else:
-            try:
-                found = [np.array([row[i] for row in rows]) for i in range(len(wanted))]
-            except ValueError:
-                allowed = ("numbers of one shape in every episode",)
-                raise UnknownOption("value of an outcome", "of several shapes", allowed) from None
+        try:
+            found = [np.array([row[i] for row in rows]) for i in range(len(wanted))]
+        except ValueError:
+            allowed = ("numbers of one shape in every episode",)
+            raise UnknownOption("value of an outcome", "of several shapes", allowed) from None
         columns: dict[str, Floats] = {}
         for outcome, values in zip(wanted, found, strict=True):
             text = column(outcome)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from scm_world.policies.scripted import AnyPolicy
+    from scm_world.queries.together import Episodes
     from scm_world.world.compiled_task import Vectors
 
 CONFIDENCE = 0.95
@@ -71,6 +72,11 @@ class Outcome(Frozen):
             raise UnknownOption("episode", episode, ("an Episode, such as that of a rollout",))
         decided = self.name in episode.eras[0].compiled.decided
         return np.asarray(self._of_many(np.asarray(episode[self.name])[None], decided)[0])
+
+    def of_each(self, episodes: Episodes) -> Floats:
+        """Compute the outcome of episodes that are read together, shape (n, ...)."""
+        compiled = episodes.compiled
+        return self._of_many(episodes.read(self.name), self.name in compiled.decided)
 
     def _of_many(self, values: Value, decided: bool = False) -> Floats:
         """Compute the outcome from values of shape (n, instants, *shape); return shape (n, ...).
@@ -155,6 +161,14 @@ def read(outcome: Outcome | Function, episode: Episode) -> Floats:
     with blamed(f"the outcome {label(outcome)!r}"):
         value = outcome(episode)
     return as_numbers(value, outcome)
+
+
+def read_each(outcome: Outcome | Function, episodes: Episodes) -> Iterable[Floats]:
+    """Compute an outcome of episodes that are read together, as finite numbers of each."""
+    if not isinstance(outcome, Outcome):
+        return [read(outcome, episode) for episode in episodes]
+    found = outcome.of_each(episodes)
+    return found if np.isfinite(found).all() else [as_numbers(one, outcome) for one in found]
 
 
 def as_numbers(value: object, outcome: object) -> Floats:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 import multiprocessing
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
+from itertools import count
 from typing import Any, final
 from weakref import WeakKeyDictionary
 
@@ -17,17 +18,14 @@ import numpy as np
 from scm_world._arguments import whole_number
 from scm_world._fingerprint import digest, fingerprint
 from scm_world._types import Floats
-from scm_world.backends.base import SeparateScenes
-from scm_world.errors import EngineFailure, ScmWorldError, UnknownOption, blamed
+from scm_world.errors import ScmWorldError, UnknownOption
 from scm_world.graph import SCM
 from scm_world.policies.scripted import OpenLoopPolicy, as_policy
-from scm_world.queries.episodes import ALL, Episode, Era, Unit, run, who
+from scm_world.queries.episodes import Episode, Era, Unit
+from scm_world.queries.together import Episodes, Result, is_known, run_together
 from scm_world.runs.processes import cores
 from scm_world.world import CausalSystem, CompiledModel, Equations, Simulation
 from scm_world.world.batch import Batch
-
-Result = Episode | Exception
-"""The result of a unit: its episode, or the exception that stopped it."""
 
 MOST = 64
 """Largest number of worlds in a batch of an engine that says nothing else."""
@@ -35,7 +33,7 @@ MOST = 64
 LEAST = 4
 """Smallest number of units for a batch."""
 
-PRICE = 32
+PRICE = 8
 """Cost of building a world, in control steps of one thread."""
 
 EQUAL = 64
@@ -49,8 +47,7 @@ class Twins:
     def __init__(self, system: CausalSystem) -> None:
         compiled, engine = system.compiled, system.backend
         self.model = compiled if isinstance(compiled, CompiledModel) else None
-        # Whether the backend steps many worlds in one call:
-        self.batches = engine is not None and engine.batch is not SeparateScenes
+        self.has_engine = engine is not None
         self.is_exact = engine is None or not engine.capabilities.floor
         self.scenes = None if engine is None else engine.capabilities.scenes
         self._floors: dict[str, tuple[int, list[Floats]]] = {}  # with the number of units
@@ -61,10 +58,11 @@ class Twins:
         self._free: list[Any] = []
         self._lock = threading.RLock()  # the garbage collector may return a twin within it
         self._members: list[Simulation] = []  # worlds of batches
+        self._rows: Batch | None = None  # in whose rows episodes run together
         self._batching = threading.RLock()
 
     def __getstate__(self) -> dict[str, Any]:
-        private = ("_free", "_lock", "_members", "_batching")
+        private = ("_free", "_lock", "_members", "_rows", "_batching")
         return {name: value for name, value in self.__dict__.items() if name not in private}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -102,51 +100,73 @@ class Twins:
                         world.backend.read()  # leaves the batch
                 self._members = worlds + self._members
 
+    @contextmanager
+    def rows(self, n: int, names: tuple[str, ...], threads: int) -> Iterator[Batch]:
+        """Provide a batch of n worlds or more that computes ``names`` in every step.
+
+        Its worlds are rows, which may be left in any state.
+        """
+        with self._batching:
+            batch, self._rows = self._rows, None
+            if batch is None or len(batch) < n or batch.threads != threads:
+                if batch is not None:
+                    batch.close()
+                first = self._make()
+                batch = Batch._like(first, first.made_with, n, threads)
+            batch.names = names
+            try:
+                yield batch
+            finally:
+                self._rows = batch
+
     @property
     def batched(self) -> int:
-        """Number of existing twins for batches."""
-        return len(self._members)
+        """Number of rows in which episodes run together."""
+        return 0 if self._rows is None else len(self._rows)
 
     def run(
         self,
         units: Sequence[Unit],
-        finish: Callable[[Episode], Any],
+        finish: Callable[[Episodes], Iterable[Any]],
         workers: int | None = None,
         catch: type[Exception] | tuple[type[Exception], ...] = (),
     ) -> list[Any]:
         """Run units of equal steps and names, and reduce their episodes with ``finish``.
 
-        Exceptions of the kinds ``catch`` are results, too; others propagate.
+        It is given episodes that ran together, and returns a result for each. Exceptions of the
+        kinds ``catch`` are results, too; others propagate.
         """
-
-        def ended(result: Result) -> Any:
-            if isinstance(result, catch):
-                return result
-            if isinstance(result, Exception):
-                raise result
-            return finish(result)
-
         given = 1 if workers is None else whole_number("workers", workers, least=1)
         is_child = multiprocessing.parent_process() is not None  # workers share the cores
         threads = given if workers is not None or is_child else cores()
-        if self.model is not None:
-            results = self._solved(units)
-        elif n := self._batch_size(units, threads):
-            results = self._in_batches(units, n, threads)
-        elif given == 1:
-            results = (self._alone(unit) for unit in units)
-        else:
-            with ThreadPoolExecutor(given) as pool:  # backends release the GIL
-                return [*map(ended, pool.map(self._alone, units))]
-        with closing(results):  # type: ignore[type-var] # all of these are generators
-            return [*map(ended, results)]
+        found: list[Any] = [None] * len(units)
+        with ExitStack() as open_:
+            parts: Iterable[Result]
+            if self.model is not None:
+                parts = self._solved(units)
+            elif n := self._batch_size(units, threads):
+                parts = open_.enter_context(closing(self._in_batches(units, n, threads)))
+            elif given == 1:
+                parts = (([place], self._alone(unit)) for place, unit in enumerate(units))
+            else:
+                pool = open_.enter_context(ThreadPoolExecutor(given))  # backends release the GIL
+                parts = zip(([i] for i in count()), pool.map(self._alone, units), strict=False)
+            for places, result in parts:
+                if isinstance(result, catch):
+                    found[places[0]] = result
+                elif isinstance(result, Exception):
+                    raise result
+                else:
+                    for place, one in zip(places, finish(result), strict=True):
+                        found[place] = one
+        return found
 
     def floors(
         self,
         units: Sequence[Unit],
         what: Any,
         found: Sequence[Floats],
-        read: Callable[[Episode], list[Floats]],
+        read: Callable[[Episodes], Iterable[Sequence[Floats]]],
         workers: int | None,
     ) -> list[Floats]:
         """Return how far apart equal runs are, at most, in each number that is read of an episode.
@@ -158,36 +178,36 @@ class Twins:
             units: The units, which differ in their numbers only.
             what: The variables that are read.
             found: Its values in all of them, shape (n, ...) each.
-            read: Reads it.
+            read: Reads it, of each episode.
             workers: As in ``run``.
         """
-        count = min(len(units), EQUAL)
+        some = min(len(units), EQUAL)
         key = digest(fingerprint({"unit": replace(units[0], seed=0, number=0), "read": what}))
         known, largest = self._floors.get(key, (0, [np.zeros(one.shape[1:]) for one in found]))
-        if known < count:
-            again = self.run(units[:count], read, workers)
+        if known < some:
+            again = self.run(units[:some], read, workers)
             apart = [
-                np.abs(one[:count] - [row[i] for row in again]).max(axis=0)
+                np.abs(one[:some] - [row[i] for row in again]).max(axis=0)
                 for i, one in enumerate(found)
             ]
             largest = [np.maximum(one, other) for one, other in zip(largest, apart, strict=True)]
-            self._floors[key] = count, largest
+            self._floors[key] = some, largest
         return largest
 
-    def require_exact(self, question: str) -> None:
+    def require_exact(self, question: str, *, independent: bool = False) -> None:
         """Refuse a question that compares equal runs bit for bit; see ``Simulation``."""
-        if not self.is_exact:
+        if not self.is_exact or (independent and self.has_engine):
             with self.twin() as system:
-                system.require_exact(question)
+                system.require_exact(question, independent=independent)
 
     def episode(self, unit: Unit) -> Episode:
         """Run a unit in a twin."""
         with self.twin() as system:
             return unit.run(system, self)
 
-    def _alone(self, unit: Unit) -> Result:
+    def _alone(self, unit: Unit) -> Episodes | Exception:
         try:
-            return self.episode(unit)
+            return Episodes.of(self.episode(unit))
         except Exception as error:
             return error
 
@@ -196,7 +216,7 @@ class Twins:
 
         An engine may say how many scenes it steps best, which are then built once.
         """
-        if not self.batches or len(units) < LEAST or not is_known(units[0]) or units[0].listens:
+        if len(units) < LEAST or not is_known(units[0]) or units[0].listens:
             return 0
         steps = len(units) * (units[0].steps - units[0].first)
         worth = math.isqrt(steps * threads // PRICE)
@@ -205,14 +225,22 @@ class Twins:
         most = self.scenes or min(max(worth, self.batched), MOST)
         return math.ceil(len(units) / math.ceil(len(units) / most))
 
-    def _in_batches(self, units: Sequence[Unit], n: int, threads: int) -> Iterator[Result]:
-        with self.together(n, units[0].names, threads) as batch:
+    def _in_batches(
+        self, units: Sequence[Unit], n: int, threads: int
+    ) -> Generator[Result, None, None]:
+        """Run units in batches of n rows, those of one plan next to one another."""
+        plans = {id(unit.plan): rank for rank, unit in reversed([*enumerate(units)])}
+        order = sorted(range(len(units)), key=lambda place: plans[id(units[place].plan)])
+        with self.rows(n, units[0].names, threads) as batch:
             for first in range(0, len(units), n):
-                some = units[first : first + n]
+                here = order[first : first + n]
+                some = [units[place] for place in here]
                 try:
-                    yield from run_together(batch, some, self)
-                except EngineFailure:  # run separately, it ends its own unit only
-                    yield from map(self._alone, some)
+                    parts = [*run_together(batch, some, self)]
+                except ScmWorldError:  # run separately, it ends its own unit only
+                    parts = [([place], self._alone(unit)) for place, unit in enumerate(some)]
+                for places, result in parts:
+                    yield [here[place] for place in places], result
 
     # --- equations ----------------------------------------------------------------------------
 
@@ -221,9 +249,12 @@ class Twins:
         together = None
         with suppress(ScmWorldError):  # run separately, it ends its own unit only
             together = self._solved_together(units)
-        yield from map(self._alone, units) if together is None else together
+        if together is None:
+            yield from (([place], self._alone(unit)) for place, unit in enumerate(units))
+        else:
+            yield from together
 
-    def _solved_together(self, units: Sequence[Unit]) -> list[Episode] | None:
+    def _solved_together(self, units: Sequence[Unit]) -> list[Result] | None:
         """Run units of each plan together; None if policies or events do not allow that."""
         first, compiled = units[0], self.model
         assert compiled is not None  # noqa: S101
@@ -244,91 +275,17 @@ class Twins:
         for row, policy in enumerate(policies):
             one.reset(seed=units[row].seed, episode=units[row].number)
             actions[row] = policy.ahead(one, 0, first.steps)  # type: ignore[attr-defined] # OpenLoopPolicy
-        found: dict[int, Episode] = {}  # by row
+        found = list[Result]()
         for rows in plans.values():
-            how: Any = {"seed": [units[row].seed for row in rows], "names": ()}
+            mine = [units[row] for row in rows]
+            how: dict[str, Any] = {"seed": [unit.seed for unit in mine], "names": ()}
             how["seed"] = how["seed"][0] if len({*how["seed"]}) == 1 else how["seed"]
-            how["number"] = [units[row].number for row in rows]
+            how["number"] = [unit.number for unit in mine]
             how["policy"] = lambda it, taken=actions[rows]: taken[:, it.index]
-            episode = replace(units[rows[0]], **how).run(Equations(compiled, len(rows)))
-            for row, path in zip(rows, np.stack(episode.vectors, axis=1), strict=True):
-                found[row] = Episode(self, units[row], vectors=[*path], taken=[*actions[row]])
-                found[row].eras.append(Era(0, compiled, {}))
-        return [found[row] for row in range(len(units))]
-
-
-def is_known(unit: Unit) -> bool:
-    """Return whether a unit can be in a batch: its actions are known beforehand."""
-    return isinstance(as_policy(unit.policy), OpenLoopPolicy) and ALL not in unit.names
-
-
-def run_together(batch: Batch, units: Sequence[Unit], twins: Twins | None = None) -> list[Result]:
-    """Run units in the rows of a batch, which has at least as many worlds.
-
-    The units have equal instants, names that the tables of the batch contain, and open-loop
-    policies. A backend that loses a state stops all of them.
-    """
-    running = _Together(batch, units, twins)
-    run(running, units[0].first, units[0].steps)
-    return running.results()
-
-
-@final
-class _Together:
-    """Running units in the rows of a batch; an error stops its own unit only."""
-
-    def __init__(self, batch: Batch, units: Sequence[Unit], twins: Twins | None) -> None:
-        self._batch = batch
-        self._rows = [Episode._of(twins, unit, batch.world(i)) for i, unit in enumerate(units)]
-        self._errors: dict[int, Exception] = {}
-        self._first, self._steps = units[0].first, units[0].steps
-        self._goes_on = np.arange(len(batch)) < len(units)
-        self._pending = np.zeros(len(batch), dtype=np.bool_)  # stepped, and not recorded
-        n_actions = self._rows[0].world.compiled.n_actions
-        self._commands = np.zeros((self._steps, len(batch), n_actions))
-        for row in range(len(units)):
-            self._alone(row, self._first)
-
-    def _intervene(self, step: int) -> None:
-        for row in np.flatnonzero(self._goes_on).tolist():
-            one = self._rows[row]
-            if one.plan._concerns(one.world, step, one.memory):
-                self._alone(row, step)
-
-    def _record(self, step: int) -> None:
-        """Record an instant of the rows that have not been recorded alone."""
-        for row in np.flatnonzero(self._pending).tolist():
-            self._rows[row]._note(step, ready=True)
-
-    def _act(self, step: int) -> None:
-        if self._goes_on.any():
-            self._batch.advance(self._commands[step], self._goes_on)
-        for row in np.flatnonzero(self._goes_on).tolist():
-            self._rows[row]._complete()
-        self._pending[:] = self._goes_on
-
-    def results(self) -> list[Result]:
-        return [self._errors.get(row, one._ended()) for row, one in enumerate(self._rows)]
-
-    def _alone(self, row: int, step: int) -> None:
-        """Reset or intervene in one world, record the instant, and get its further actions."""
-        one = self._rows[row]
-        self._pending[row] = False
-        self._batch.world(row)
-        try:
-            if step == self._first:
-                one._begin()
-            else:
-                one._intervene(step)
-            one._note(step)
-            with blamed(lambda: who(one.policy, one.world)):
-                given = one.policy.ahead(one.world, one.world.index, self._steps - step)
-            for command, action in zip(self._commands[step:, row], given, strict=True):
-                command[:] = one.world.compiled.clipped(action)
-            one.taken[step:] = np.array(given)
-        except Exception as error:  # ends this unit only
-            self._errors[row] = error
-            self._goes_on[row] = False
+            episode = replace(mine[0], **how).run(Equations(compiled, len(rows)), self)
+            episode.eras = [Era(0, compiled, {})]
+            found.append((rows, Episodes(mine, episode)))
+        return found
 
 
 _TWINS: WeakKeyDictionary[Any, Twins] = WeakKeyDictionary()

@@ -188,7 +188,7 @@ class GraphReport(Report):
     rollouts: int
     edges: tuple[EdgeReport, ...]
     unstable: dict[str, float] = {}
-    rounding: float = 0.0
+    rounding: dict[str, float] = {}
     seconds: float
     versions: dict[str, str]
 
@@ -296,7 +296,7 @@ class GraphReport(Report):
             seed=seed,
             rollouts=effects.rollouts,
             unstable=effects.unstable,
-            rounding=max(effects.rounding.values(), default=0.0),
+            rounding=dict(effects.rounding),
             edges=tuple(edges),
             **fields,
         )
@@ -321,11 +321,12 @@ class GraphReport(Report):
 
     def rounded(self) -> list[Row]:
         """Say which changes are no effects, on an engine that computes with fewer than 64 bits."""
-        said = (
-            f"up to {self.rounding:g} of a state, or of 1: it computes with fewer than 64 bits,\n"
-        )
-        said += "and bodies that do not touch change one another; edges by contact count in contact"
-        return [("no effect on this engine", said)] if self.rounding else []
+        if not self.rounding:
+            return []
+        name, size = max(self.rounding.items(), key=lambda item: item[1])
+        said = f"up to {size:.2g} (of {name}) by its value or 1: it computes with few bits, and\n"
+        said += "bodies that do not touch change one another; edges by contact count in contact"
+        return [("no effect on this engine", said)]
 
     def sized(self) -> Row:
         """Return the strongest edge between two variables, the weakest, and the median."""
@@ -589,7 +590,11 @@ def _reasons(world: Simulation | None, effects: Effects) -> Callable[[Edge], str
             if effects.sought and not effects.unsaturated[action]:
                 sought = f"in all {effects.sought} probe states in which another was sought"
                 return f"the command {action} was saturated {sought}"
-        beyond = " beyond rounding and noise" * (effects.largest.get(edge.key, 0.0) > 0.0)
+        size, room = effects.largest.get(edge.key, 0.0), effects.rounding.get(edge.effect, 0.0)
+        if size > 0.0 and room:
+            others = f"bodies that do not touch change {edge.effect} by {room:.2g}"
+            return f"it changed by {effects.relative[edge.key]:.2g} of it or of 1, and {others}"
+        beyond = " beyond rounding and noise" * (size > 0.0)
         found = f"no difference{beyond}, though {cause} was changed in {states} of the probe states"
         return found + f", and contacts joined their bodies in {touched}" * (touched > 0)
 

@@ -61,7 +61,7 @@ class Planned(CausalSystem):
 
     _given = Plan()
     _schedule = _Schedule()
-    is_planned = False
+    is_planned, plan_end = False, 0.0  # of this episode: the last step at which its plan may act
 
     @property
     def plan(self) -> Plan:
@@ -155,7 +155,7 @@ class Planned(CausalSystem):
         for name in acts:
             memory.forget(name, step)
         audit = plan._act(self, step, memory, doing, acts)
-        self._schedule = now._replace(plan=plan, memory=memory)
+        self._follow(now._replace(plan=plan, memory=memory))
         return audit or doing({})
 
     def step(self, action: ArrayLike) -> None:
@@ -178,14 +178,16 @@ class Planned(CausalSystem):
             raise
 
     def _follow(self, schedule: _Schedule) -> None:
-        self._schedule, self.is_planned = (
-            schedule,
-            any(parts for _, parts in schedule.plan.layers()),
-        )
+        self._schedule, self.plan_end = schedule, 0.0
+        self.is_planned = any(parts for _, parts in schedule.plan.layers())
+        if self.is_planned:
+            self.plan_end = max((act.time.last for _, act in schedule.plan.timed()), default=0.0)
 
     def _may_act(self, step: int) -> bool:
         """Return whether the plan of the episode may still intervene at a control step."""
         now = self._schedule
+        if step > self.plan_end:
+            return False
         return step != now.acted and now.plan._concerns(self, step, now.memory)
 
     def act(self) -> Audit | None:
@@ -455,6 +457,8 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         begins: Any = None,
         held_out: float | None = None,
         setups: Sequence[Mapping[str, object]] | None = None,
+        columns: Mapping[str, str] | None = None,
+        ignore: Iterable[str] = (),
         symmetric: bool = False,
         progress: Progress | None = None,
         search: Search | None = None,
@@ -492,6 +496,8 @@ class World(Planned, _System, Questions, metaclass=_Opener):
             setups: The set-up of each of several recordings: values of parameters that were set for
                 it, ``[{}, {"weight.mass": 1.0}]``. A recording may carry its own: a column
                 ``do.weight.mass``, or arrays by name with ``"do": {"weight.mass": 1.0}``.
+            columns: Names of this world by those of the tables, ``{"torque": "motor.control"}``.
+            ignore: Patterns of columns that are left out.
             symmetric: Whether ranges [-a, a], such as those of forces, stay symmetric.
             progress: Called after each round of estimating the noise.
             search: What finds the next minimum of least squares; ``gauss_newton`` if None. See
@@ -514,9 +520,9 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         """
         from scm_world.fit import fit
 
-        options: Any = {"noise": noise, "window": window, "begins": begins}
+        options: dict[str, Any] = {"noise": noise, "window": window, "begins": begins}
         options |= {"held_out": held_out, "setups": setups, "progress": progress}
-        options |= {"symmetric": symmetric}
+        options |= {"symmetric": symmetric, "columns": columns, "ignore": ignore}
         options |= {} if search is None else {"search": search}
         return fit(self, recording, parameters, **options)
 
@@ -531,6 +537,8 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         window: int | None = None,
         begins: Any = None,
         setups: Sequence[Mapping[str, object]] | None = None,
+        columns: Mapping[str, str] | None = None,
+        ignore: Iterable[str] = (),
         progress: Progress | None = None,
     ) -> Deviation:
         """Find which parameter accounts for the deviation of a recording from this world.
@@ -551,6 +559,8 @@ class World(Planned, _System, Questions, metaclass=_Opener):
             window: Number of rows of a window; 50 if None.
             begins: See ``fit``.
             setups: See ``fit``.
+            columns: See ``fit``.
+            ignore: See ``fit``.
             progress: Called after each fit.
 
         Raises:
@@ -558,8 +568,14 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         """
         from scm_world.fit import explain
 
-        options: Any = {"noise": noise, "window": window, "begins": begins, "setups": setups}
-        return explain(self, recording, candidates, most=most, progress=progress, **options)
+        options: dict[str, Any] = {
+            "noise": noise,
+            "window": window,
+            "begins": begins,
+            "setups": setups,
+        }
+        options |= {"columns": columns, "ignore": ignore, "most": most}
+        return explain(self, recording, candidates, progress=progress, **options)
 
     def for_fit(self, recording: object) -> World:
         """Return the world that a fit computes: of equations, that of their step function."""

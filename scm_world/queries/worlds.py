@@ -182,7 +182,7 @@ class EngineWorlds(Batch, ManyWorlds):  # type: ignore[misc] # what ``Batch`` ha
 
     def given(self, do: Mapping[str, Any]) -> Self:
         """Return other worlds with further interventions; see ``World.given``."""
-        threads, names = self._threads, self._names
+        threads, names = self.threads, self.names
         begun = [*self._done, *(world.has_begun or None for world in self.systems)]
         if self._options is not None and all(one is None for one in begun):
             first = self.one.given(do)

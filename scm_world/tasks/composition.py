@@ -71,9 +71,12 @@ class Commands(ABC):
 
     Attributes:
         noisy: Where the noise of a control step is in the command, by name.
+        added: If all that happens is that normal noise is added: the variable that scales it, its
+            stream, and its standard deviations where that is one, shape (n_commands,); else None.
     """
 
     noisy: Mapping[str, slice] = {}  # a constant
+    added: tuple[str, str, Floats] | None = None
 
     def applies(self, values: Values) -> Any:
         """Return whether it is needed, given the values of all that physics does not move.

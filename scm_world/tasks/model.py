@@ -303,7 +303,9 @@ class ModelTask(DeclaredTask):
             return max(1, math.ceil(steps - 1e-9))
         if steps < 1.0 - 1e-9 or abs(steps - round(steps)) > 1e-6:
             allowed = f"a multiple of the physics step, {self.time_unit:g} s"
-            raise UnknownOption("control_dt", self.control_dt, (allowed,))
+            other = f"timestep={self.control_dt / max(math.ceil(steps), 1):.6g}"
+            advice = f"another one if the file's physics step divides it, such as {other}"
+            raise UnknownOption("control_dt", self.control_dt, (allowed, advice))
         return round(steps)
 
     def _check_names(self) -> None:

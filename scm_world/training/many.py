@@ -8,25 +8,25 @@ import time
 from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
-from datetime import timedelta
 from pathlib import Path
 from typing import Any, final
 
 import numpy as np
 
 from scm_world._arguments import missing
-from scm_world._types import Floats, Mask
 from scm_world.env.observer import FAILED
+from scm_world.env.tensors import HostEnvs, TensorEnvs, has_device
 from scm_world.errors import Diverged, UnknownOption
 from scm_world.policies import MlpPolicy, PolicyAbout, load_policy, save_policy
 from scm_world.policies.cards import OPTIONS
 from scm_world.queries.progress import Progress, Tell
 from scm_world.runs.files import make_folder, write_whole
 from scm_world.runs.study import Study
-from scm_world.training.export import Evaluations, begin_tensors
+from scm_world.training.export import begin_tensors
 from scm_world.training.recipe import Recipe
+from scm_world.training.rounds import Rounds, restore_last
 from scm_world.training.settings import Ppo
-from scm_world.training.worlds import CHECKPOINTS, LINES, SEEDS, SUCCESS, is_due, make_envs, scales
+from scm_world.training.worlds import SEEDS, SUCCESS, make_envs, scales
 
 try:
     import torch
@@ -51,9 +51,9 @@ RECENT = 100
 class ManyPpo:
     """PPO of rsl-rl in the worlds of a recipe.
 
-    Observations and rewards are computed for all worlds together by the environment, on the CPU,
-    and copied to the device once in each control step. Where an episode is cut off, the value of
-    its last observation takes the place of the rewards that are left.
+    Where the engine has its states on a device, observations, rewards and commands are computed
+    there, by ``TensorEnvs``; else by the environments, on the host. Where an episode is cut off,
+    the value of its last observation takes the place of the rewards that are left.
 
     Args:
         recipe: How it is trained.
@@ -64,6 +64,7 @@ class ManyPpo:
 
     Attributes:
         num_timesteps: Number of control steps so far, in all worlds together.
+        news: Sentences about where control steps are computed; the caller empties it.
 
     Source:
         Rudin et al., *Learning to Walk in Minutes Using Massively Parallel Deep Reinforcement
@@ -101,7 +102,7 @@ class ManyPpo:
         first = self._seen(np.zeros((n, *space.shape), np.float32))
         groups = {name: [SEEN] for name in ("actor", "critic")}
         network = recipe.network
-        shape: Any = {"hidden_dims": [*network.hidden], "activation": network.activation}
+        shape: dict[str, Any] = {"hidden_dims": [*network.hidden], "activation": network.activation}
         normal = {
             "class_name": "GaussianDistribution",
             "init_std": float(np.exp(network.log_std)),
@@ -133,10 +134,12 @@ class ManyPpo:
             device=self.device,
         )
         # Of rewards: mean, variance and number of discounted returns, and those under way.
-        self._moments, self._returns = np.array([0.0, 1.0, 1e-4]), np.zeros(n)
+        self._moments = torch.tensor([0.0, 1.0, 1e-4], dtype=torch.float64, device=self.device)
+        self._returns = torch.zeros(n, dtype=torch.float64, device=self.device)
         self._now: TensorDict | None = None
         self.ended = deque[dict[str, float]](maxlen=RECENT)
         self.over = self.failed = 0  # episodes
+        self.news: list[str] = []
 
     def close(self) -> None:
         """Free the engine."""
@@ -144,7 +147,7 @@ class ManyPpo:
 
     # --- worlds ---------------------------------------------------------------------------------
 
-    def _seen(self, observation: Floats) -> TensorDict:
+    def _seen(self, observation: Any) -> TensorDict:
         rows = torch.as_tensor(observation, device=self.device) * self._scale
         return TensorDict({SEEN: rows}, batch_size=[len(rows)], device=self.device)
 
@@ -152,16 +155,32 @@ class ManyPpo:
         """Begin all episodes; staggered, world i of n begins i / n of an episode later."""
         envs, n = self._envs, self.recipe.worlds
         seen, _ = envs.reset(seed=self._seed)
+        self._worlds: TensorEnvs | HostEnvs = HostEnvs(envs, seen)
+        if has_device(envs):
+            self._worlds = TensorEnvs(envs)
+            self._stay_or_leave()
+            hosted = ", ".join(self._worlds.on_host)
+            if hosted:
+                self.news.append(f"computed on the host, in each step: {hosted}")
         begin = self._length * np.arange(n) // n
-        idle = np.zeros(envs.action_space.shape, np.float32)
+        idle = torch.zeros(envs.action_space.shape)
         for step in range(1, int(begin[-1]) + 1 if self.recipe.staggered else 0):
-            envs.step(idle)
+            self._worlds.step(idle)
             if (late := begin == step).any():
-                seen, _ = envs.reset(options={"reset_mask": late})
-        self._sums, self._lengths = np.zeros(n), np.zeros(n, int)
-        return self._seen(seen)
+                self._worlds.reset(late)
+            self._stay_or_leave()
+        # Of the episodes under way: their returns and lengths.
+        self._sums, self._lengths = torch.zeros((2, n), dtype=torch.float64, device=self.device)
+        return self._seen(self._worlds.seen)
 
-    def _scaled(self, rewards: Floats, done: Mask) -> Floats:
+    def _stay_or_leave(self) -> None:
+        """Let control steps be computed on the host from now on, if the device cannot."""
+        if self._worlds.why_not:
+            self.news.append(f"control steps are computed on the host: {self._worlds.why_not}")
+            self._worlds.leave()
+            self._worlds = HostEnvs(self._envs, self._worlds.seen)
+
+    def _scaled(self, rewards: torch.Tensor, done: torch.Tensor) -> torch.Tensor:
         """Divide rewards by the running standard deviation of the discounted return."""
         if not self.recipe.scale_rewards:
             return rewards
@@ -169,35 +188,33 @@ class ManyPpo:
         mean, variance, count = self._moments
         n, apart = len(rewards), self._returns.mean() - mean
         total = count + n
-        spread = variance * count + self._returns.var() * n + apart**2 * count * n / total
-        self._moments[:] = mean + apart * n / total, spread / total, total
+        spread = self._returns.var(correction=0) * n + apart**2 * count * n / total
+        self._moments = torch.stack(
+            (mean + apart * n / total, (variance * count + spread) / total, total)
+        )
         self._returns[done] = 0.0
-        scaled: Floats = np.clip(rewards / np.sqrt(self._moments[1] + 1e-8), -BOUND, BOUND)
-        return scaled
+        return (rewards / (self._moments[1] + 1e-8).sqrt()).clip(-BOUND, BOUND)
 
     def _step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor]:
         """Take a control step in all worlds: observations, scaled rewards, and which are over."""
-        given = actions.clamp(-1.0, 1.0).cpu().numpy()
-        seen, rewards, terminated, truncated, infos = self._envs.step(given)
-        done = terminated | truncated
+        now = self._worlds.step(actions.clamp(-1.0, 1.0))
+        rewards, terminated = now.rewards.to(self.device), now.terminated.to(self.device)
+        done = terminated | now.truncated.to(self.device)
         self._sums += rewards
-        self._lengths += 1
-        scaled = np.asarray(self._scaled(rewards, done), np.float32)
-        earned = torch.as_tensor(scaled, device=self.device)
-        if done.any():
-            cut = np.flatnonzero(truncated & ~terminated)
-            if len(cut):
-                last = self._seen(np.stack([*infos["final_obs"][cut]]))
-                earned[cut] += self.recipe.settings.gamma * self._critic(last)[:, 0]
-            final = infos["final_info"]
-            for row in np.flatnonzero(done).tolist():
-                one = {"return": self._sums[row], "length": self._lengths[row]}
-                names = (name for name in (SUCCESS, "fractional_success") if name in final)
-                self.ended.append({**one, **{name: float(final[name][row]) for name in names}})
-            self.over += int(done.sum())
-            self.failed += int(final[FAILED][done].sum()) if FAILED in final else 0
-            self._sums[done], self._lengths[done] = 0.0, 0
-        return self._seen(seen), earned, torch.as_tensor(done, device=self.device)
+        self._lengths += 1.0
+        earned = self._scaled(rewards, done).float()
+        if len(rows := now.rows):
+            value = self._critic(self._seen(now.last))[:, 0]
+            earned[rows] += self.recipe.settings.gamma * value * ~terminated[rows]
+            facts = {"return": self._sums[rows], "length": self._lengths[rows], **now.facts}
+            table = {name: np.asarray(column.tolist(), float) for name, column in facts.items()}
+            self.failed += int(table.pop(FAILED).sum())
+            self.over += len(rows)
+            columns = (zip(table, row, strict=True) for row in zip(*table.values(), strict=True))
+            self.ended.extend(map(dict, columns))
+            self._sums[rows], self._lengths[rows] = 0.0, 0.0
+            self._stay_or_leave()
+        return self._seen(now.seen), earned, done
 
     def round(self) -> dict[str, float]:
         """Play ``n_steps`` in all worlds, and update the networks; return the losses."""
@@ -257,21 +274,21 @@ class ManyPpo:
 
     def state(self) -> bytes:
         """Return weights, optimizer, scale of rewards and random numbers, as a file of torch."""
-        moments = torch.as_tensor(self._moments.copy())
-        torch.save({**self._ppo.save(), "rewards": moments}, file := io.BytesIO())
+        torch.save({**self._ppo.save(), "rewards": self._moments}, file := io.BytesIO())
         return file.getvalue()
 
-    def restore(self, content: bytes, steps: int) -> None:
+    def restore(self, content: bytes, steps: int) -> str:
         """Restore what ``state`` returned, after so many control steps; episodes begin anew.
 
-        Only tensors are read, which runs no code.
+        Only tensors are read, which runs no code. Nothing else is to be said of it.
         """
         found = torch.load(io.BytesIO(content), map_location=self.device, weights_only=True)
         self._ppo.load(found, None, strict=True)
-        self._moments[:] = found["rewards"].cpu().numpy()
+        self._moments = found["rewards"]
         self.num_timesteps = steps
         torch.manual_seed(self._seed + steps)
         self._seed += steps  # other episodes than those before
+        return ""
 
 
 @contextmanager
@@ -311,8 +328,7 @@ def learn(
         UnwritableFolder: The disk is full, or permission is missing.
     """
     folder = Path(str(study.folder))
-    checkpoints = Path(str(make_folder(study.path("checkpoints"))))
-    scores = Evaluations(recipe, backend, folder)
+    make_folder(study.path("checkpoints"))
 
     def policy() -> MlpPolicy:
         return model.policy({**card, "steps": model.num_timesteps})
@@ -321,51 +337,29 @@ def learn(
         study.keep(f"checkpoints/run_{model.num_timesteps}_steps.zip", model.state())
         save_policy(folder / "policy.safetensors", policy())
 
-    resume(model, study, checkpoints, tell)
+    restore_last(study, model.restore, tell)
     first = model.num_timesteps
     curve, rows = folder / (f"progress-{first}.csv" if first else "progress.csv"), []
-    reported, before = time.perf_counter(), first
+    how: dict[str, Any] = {"backend": backend, "progress": progress, "tell": tell}
+    rounds = Rounds(recipe, study, **how, save=save, policy=policy)
+    rounds.begin(first)
     try:
         while model.num_timesteps < recipe.steps:
-            then = model.num_timesteps
-            losses = model.round()
-            steps, now = model.num_timesteps, time.perf_counter()
-            rows.append({**dict(_recent(model)), **{f"train/{n}": v for n, v in losses.items()}})
+            losses, recent = model.round(), dict(_recent(model))
+            while model.news:
+                tell(model.news.pop(0))
+            steps = model.num_timesteps
+            rows.append({**recent, **{f"train/{n}": v for n, v in losses.items()}})
             rows[-1] |= {"time/total_timesteps": steps, "time/cpu_seconds": time.process_time()}
-            if progress is not None:
-                progress(min(steps, recipe.steps), recipe.steps)
-            if now - reported >= LINES:
-                rate = (steps - before) / (now - reported)
-                left = timedelta(seconds=round(max(recipe.steps - steps, 0) / rate))
-                means = {name.partition("/")[2]: value for name, value in _recent(model)}
-                said = ", ".join(f"{name} {value:.3g}" for name, value in means.items())
-                speed = f"{rate:,.0f} steps per second, about {left} left"
-                tell(f"{steps:,} of {recipe.steps:,} steps: {said}, {speed}")
-                reported, before = now, steps
-            if steps < recipe.steps and is_due(CHECKPOINTS, then, steps, recipe):
-                save()
-            if recipe.trials.protocols and is_due(recipe.trials.times, then, steps, recipe):
-                tell(f"{steps:,} steps: {scores.add(policy(), steps)}")
+            means = {name.partition("/")[2]: value for name, value in recent.items()}
+            rounds.look(steps, (f"{name} {value:.3g}" for name, value in means.items()))
     finally:  # also after Ctrl-C
         if rows:
             _write(curve, rows)
             save()
     if model.failed:
         tell(f"{model.failed:,} of {model.over:,} episodes ended as states grew beyond all bounds")
-    return scores.best
-
-
-def resume(model: ManyPpo, study: Study, checkpoints: Path, tell: Tell) -> None:
-    """Restore the last whole checkpoint."""
-    found = {int(path.stem.split("_")[1]): path for path in checkpoints.glob("run_*.zip")}
-    for steps, path in sorted(found.items(), reverse=True):
-        try:
-            model.restore(study.kept(f"checkpoints/{path.name}", bytes), steps)
-        except Exception as error:  # of many kinds: torch, pickle, zip, sums
-            tell(f"{path} is damaged, and the checkpoint before it is taken: {error}")
-            continue
-        tell(f"goes on after {steps:,} steps")
-        return
+    return rounds.scores.best
 
 
 def _recent(model: ManyPpo) -> Iterator[tuple[str, float]]:

@@ -20,7 +20,7 @@ import numpy as np
 from pydantic import AfterValidator, Field
 
 from scm_world._arguments import typed, whole_number
-from scm_world._types import Floats, Value, Values
+from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.variables.spaces import (
     Box,
     Categories,
@@ -167,7 +167,9 @@ class Discrete(Sampler):
     values: tuple[int, ...] | tuple[float, ...] = Field(min_length=1)
     probabilities: tuple[float, ...] | None = None
 
-    def __init__(self, values: Any, probabilities: Any = None, **fields: Any) -> None:
+    def __init__(
+        self, values: ArrayLike, probabilities: ArrayLike | None = None, **fields: object
+    ) -> None:
         listed = np.ravel(values).tolist()
         chances = None if probabilities is None else tuple(np.ravel(probabilities).tolist())
         super().__init__(values=tuple(listed), probabilities=chances, **fields)

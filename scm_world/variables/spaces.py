@@ -8,7 +8,7 @@ lies on the floor is half its size.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property, lru_cache, wraps
 from math import isnan, prod
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, final
@@ -477,7 +477,12 @@ class Categories(Set):
     members: tuple[int, ...] = Field(min_length=1)
     labels: tuple[str, ...] = ()
 
-    def __init__(self, members: Any = None, labels: Any = (), **fields: Any) -> None:
+    def __init__(
+        self,
+        members: Iterable[int] | None = None,
+        labels: Sequence[str] = (),
+        **fields: object,
+    ) -> None:
         found = range(len(labels)) if members is None else members
         super().__init__(members=tuple(found), labels=tuple(labels), **fields)
 

@@ -44,7 +44,11 @@ class Subset(Frozen):
 
     parts: tuple[tuple[str, Region | None], ...]
 
-    def __init__(self, parts: Any = (), **fields: Any) -> None:
+    def __init__(
+        self,
+        parts: str | Mapping[str, object] | Iterable[tuple[str, object]] = (),
+        **fields: object,
+    ) -> None:
         if isinstance(parts, str):
             parts = {"*": parts}
         pairs = parts.items() if isinstance(parts, Mapping) else parts
@@ -89,7 +93,7 @@ class Subset(Frozen):
         return " × ".join(f"{word}[{self.parts[i][0]}]" for i, word in enumerate(words))
 
 
-def _pair(pair: Any) -> tuple[str, Any]:
+def _pair(pair: tuple[str, object]) -> tuple[str, Any]:
     pattern, region = pair
     if isinstance(region, str) and region not in SPACES:
         raise UnknownOption(f"region of {pattern}", region, (*SPACES, "a set, such as a Box"))

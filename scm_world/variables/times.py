@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal, final
 
@@ -138,6 +139,11 @@ class Time(Short):
     def stop(self) -> int | None:
         """The step at which its window ends; None if it has no window, or one without an end."""
         return None if self.during is None else self.during[1]
+
+    @property
+    def last(self) -> float:
+        """The last step at which it can take place; infinite but for a single time."""
+        return math.inf if self.at is None or self.every is not None else self.at
 
     @property
     def start(self) -> int | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from inspect import signature
@@ -11,7 +12,7 @@ from typing import Any, Literal, Self
 
 import numpy as np
 
-from scm_world._arguments import one_of, real_numbers, typed, whole_number
+from scm_world._arguments import EPISODES, one_of, real_numbers, typed, whole_number
 from scm_world._types import ArrayLike, Floats, Integers, Mask, Value
 from scm_world.backends import Backend, Capabilities, make_backend
 from scm_world.errors import (
@@ -25,6 +26,7 @@ from scm_world.errors import (
 from scm_world.graph import SCM, flatten
 from scm_world.graph.scm import request_of
 from scm_world.runs.processes import cores
+from scm_world.tasks import AnySource
 from scm_world.tasks.composition import Held, parts
 from scm_world.variables import Hard
 from scm_world.variables.distributions import word_of
@@ -34,7 +36,7 @@ from scm_world.world.audit import Audit, Audits
 from scm_world.world.compiled_task import CompiledTask, beginnings, check_functions
 from scm_world.world.mechanisms import Rows
 from scm_world.world.philox import CompiledNoise
-from scm_world.world.shared_transaction import SharedTransaction
+from scm_world.world.row_memory import RowMemory, changes
 from scm_world.world.simulation import READ_BACK, Simulation, physics_steps, warn_of_start
 from scm_world.world.snapshot import Snapshot
 
@@ -42,7 +44,87 @@ OF_WORLD = frozenset(signature(Simulation).parameters)
 """Options of a world; all others are options of its task."""
 
 
-class Batch:
+class WorldsInRows(ABC):
+    """Many worlds, of which a mask selects those that something is done to."""
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """Return the number of worlds."""
+
+    def values(self, *, where: Mask | None = None) -> dict[str, Value]:
+        """Return the present values of all variables that the selected worlds have.
+
+        Args:
+            where: Boolean mask of the worlds, shape (n,); all if None.
+
+        Returns:
+            By name, shape (m, *shape), with the m selected worlds in their order; as copies.
+
+        Raises:
+            NotReset: No episode has begun in one of them.
+        """
+        return self._values(np.flatnonzero(read_mask("where", where, len(self))))
+
+    @abstractmethod
+    def _values(self, rows: Integers) -> dict[str, Value]: ...
+
+    def do(
+        self,
+        request: Mapping[str, Any],
+        *,
+        where: Mask | None = None,
+        space: AnyRegion | None = None,
+        on_refusal: Literal["raise", "skip"] = "raise",
+    ) -> Audits:
+        """Intervene now in all selected worlds; see ``Simulation.do``.
+
+        It is computed in worlds that are alike together, else in one world after another, with
+        the same bits; see ``RowMemory.ask``.
+
+        Args:
+            request: Values or interventions by name. A value with a leading axis of n worlds, as
+                such or in a ``Hard``, gives one value to each world; others apply to all.
+            where: Boolean mask of the worlds, shape (n,); all if None.
+            space: Space in which every target must lie.
+            on_refusal: With ``"raise"``, no world changes if one of them refuses. With
+                ``"skip"``, those that refuse are unchanged and are listed in ``refused``.
+
+        Returns:
+            The audits by number of the world.
+
+        Raises:
+            InterventionError: It was refused; the message names the world. Nothing has changed.
+            NotReset: No episode has begun in one of the worlds.
+        """
+        one_of("on_refusal", on_refusal, ("raise", "skip"))
+        rows = np.flatnonzero(read_mask("where", where, len(self)))
+        return self._do(request, rows, space, skips=on_refusal == "skip")
+
+    @abstractmethod
+    def _do(
+        self,
+        request: Mapping[str, Any],
+        rows: Integers,
+        space: AnyRegion | None,
+        *,
+        skips: bool = False,
+    ) -> Audits: ...
+
+    def _numbered(self, index: int) -> int:
+        return whole_number("world", index, least=0, most=len(self) - 1)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @abstractmethod
+    def close(self) -> None:
+        """End the episodes of all worlds, and free what they hold."""
+
+
+class Batch(WorldsInRows):
     """Worlds of one task, options and backend, advanced in one call.
 
     The present values of each world are a row in the matrix of all worlds of its structure. A world
@@ -53,6 +135,10 @@ class Batch:
         worlds: The worlds; the batch owns them from now on.
         threads: Number of threads of a backend with several; the number of cores if None.
         names: Variables that are computed after every step.
+
+    Attributes:
+        names: As given; they may be replaced.
+        threads: As given.
 
     Raises:
         UnknownOption: The worlds differ in task, options or engine, or ``threads`` is not a
@@ -69,7 +155,6 @@ class Batch:
     """
 
     @typed
-    @typed
     def __init__(
         self, worlds: Sequence[Simulation], *, threads: int | None = None, names: Iterable[str] = ()
     ) -> None:
@@ -81,7 +166,7 @@ class Batch:
             raise UnknownOption("worlds", kinds, ("worlds of one task, options and engine",))
         self._set_up(given[0], given, len(given), threads, names)
         backends = [world.backend for world in given]
-        self._engine = backends[0].batch.of(backends, self._threads)
+        self._engine = backends[0].batch.of(backends, self.threads)
 
     def _set_up(
         self,
@@ -91,8 +176,8 @@ class Batch:
         threads: int | None,
         names: Iterable[str],
     ) -> None:
-        self._threads = cores() if threads is None else whole_number("threads", threads, least=1)
-        self._names, self._all = tuple(names), np.arange(n)
+        self.threads = cores() if threads is None else whole_number("threads", threads, least=1)
+        self.names, self._all = tuple(names), np.arange(n)
         self._first, self._structures = first, first.structures  # what all worlds have in common
         self._tables: dict[CompiledTask, Rows] = {}
         self._kinds: list[tuple[CompiledTask, int]] = []  # structures, and physics steps
@@ -105,22 +190,22 @@ class Batch:
         self._versions = [-1] * n
         # All others: what they did together, and the place of each in it; the key of the seed, the
         # episode and the control step then; the seeds.
-        self._done: list[SharedTransaction | None] = [None] * n
+        self._done: list[RowMemory | None] = [None] * n
         self._place = np.zeros(n, dtype=int)
         self._where, self._seeds = np.zeros((n, 3), dtype=np.uint64), [0] * n
         self._built = self._exists.copy()  # scenes that the engine has
         self._acts_alone = np.zeros(n, bool)
         self._origin: Snapshot | None = None  # before anything is drawn
         self._changes, self._is_closed = 0, False
-        self._options: Any = None  # of worlds that do not exist yet
-        self._make: Any = None  # makes an empty backend for one
+        self._options: Mapping[str, Any] | None = None  # of worlds that do not exist yet
+        self._make = partial(make_backend, first.backend.name)  # an empty backend for one
 
     @classmethod
     def _of(
         cls,
         kind: type[Simulation],
         num_worlds: int,
-        task: Any = "pushing",
+        task: AnySource = "pushing",
         *,
         threads: int | None = None,
         **options: Any,
@@ -150,8 +235,7 @@ class Batch:
         made = cls.__new__(cls)
         made._set_up(first, [None] * n, n, threads, names)
         made._options = {n: value for n, value in options.items() if n not in ("backend", "device")}
-        made._make = partial(make_backend, first.backend.name)
-        made._engine = first.backend.batch.made_by(made._make, n, made._threads)
+        made._engine = first.backend.batch.made_by(made._make, n, made.threads)
         return made
 
     def _alone(self, row: int) -> Simulation:
@@ -159,7 +243,7 @@ class Batch:
         world = self._worlds[row]
         if world is None:
             backend = self._engine.alone(row, self._make, is_built=bool(self._built[row]))
-            world = self._new(**self._options, backend=backend)
+            world = self._new(**(self._options or {}), backend=backend)
             done = self._done[row]
             if done is not None and self._origin is not None:
                 own = self._tables[done.compiled].row(row)
@@ -167,11 +251,16 @@ class Batch:
                 self._versions[row] = world.version
             world._closed |= self._is_closed
             self._worlds[row], self._exists[row] = world, True
-            self._done[row], self._acts_alone[row] = None, False
+            self._done[row], self._acts_alone[row] = None, world.acts_alone
         return world
 
     def _new(self, **options: Any) -> Simulation:
         return type(self._first)(self._structures, **options)
+
+    @property
+    def first(self) -> Simulation:
+        """A world like these, of which no episode has begun."""
+        return self._first
 
     def _existing(self, rows: Integers) -> list[int]:
         """List which of some worlds exist by themselves."""
@@ -190,7 +279,7 @@ class Batch:
             NotReset: No episode has begun in one of the worlds.
         """
         parts = []
-        for table, rows in self._by_structure(self._all):
+        for table, rows in self.by_structure(self._all):
             table.compiled.model.declared(name)
             table.evaluate((name,), rows)
             parts.append((table[name][rows], rows))
@@ -205,7 +294,7 @@ class Batch:
     def tensor(self, name: str) -> Any:
         """Return a state of all worlds, shape (n, size); see ``Simulation.tensor``."""
         self._require_states(self._all)
-        for table, _ in self._by_structure(self._all):
+        for table, _ in self.by_structure(self._all):
             table.compiled.model.declared(name)
         return self._engine.tensor(self._all, name)
 
@@ -219,21 +308,9 @@ class Batch:
             found[row] = self._alone(row).index
         return found
 
-    def values(self, *, where: Any = None) -> dict[str, Value]:
-        """Return the present values of all variables that the selected worlds have.
-
-        Args:
-            where: Boolean mask of the worlds, shape (n,); all if None.
-
-        Returns:
-            By name, shape (m, *shape), with the m selected worlds in their order; as copies.
-
-        Raises:
-            NotReset: No episode has begun in one of them.
-        """
-        rows = np.flatnonzero(read_mask("where", where, len(self)))
+    def _values(self, rows: Integers) -> dict[str, Value]:
         found: dict[str, Value] = {}
-        for table, members in self._by_structure(rows):
+        for table, members in self.by_structure(rows):
             table.evaluate(None, members)
             common = [name for name in table.compiled.model if not found or name in found]
             there = np.searchsorted(rows, members)
@@ -248,7 +325,8 @@ class Batch:
         self,
         *,
         seed: int | Sequence[int | None] | None = None,
-        where: Any = None,
+        episode: int | Sequence[int] = 0,
+        where: Mask | None = None,
         do: Mapping[str, Any] | None = None,
         space: AnyRegion | None = None,
     ) -> Audits:
@@ -256,6 +334,7 @@ class Batch:
 
         Args:
             seed: Seed of the first world, from which the others count up; or a list of seeds.
+            episode: Number of the episode of every world with a seed, or a list of n numbers.
             where: Boolean mask of the worlds to reset, shape (n,); all if None.
             do: As in ``do``.
             space: As in ``do``.
@@ -267,48 +346,54 @@ class Batch:
             InterventionError: The intervention was refused; the message names the world. The
                 episodes of all selected worlds have begun without it.
         """
-        seeds, request = read_seeds(seed, len(self)), request_of(do)
+        seeds, numbers = read_seeds(seed, len(self)), read_numbers(episode, len(self))
+        request = request_of(do)
         rows = np.flatnonzero(read_mask("where", where, len(self)))
         there = [self._first, *map(self._alone, self._existing(rows))]
         has_context = bool(getattr(request, "context", ()))  # a plan with layers, for all alike
         planned = has_times(request) or any(getattr(world, "plan", ()) for world in there)
         if not (planned or has_context):
-            self._begin_all(rows, seeds)
+            self._begin_all(rows, seeds, numbers)
             return self._do(request, rows, space) if request else Audits({}, {})
         flat = flatten(request)
 
         def begin(row: int) -> Audit | None:
             asked = request if has_context else self._request(row, flat)
-            return self._alone(row).reset(seed=seeds[row], do=asked, space=space)
+            how = {"seed": seeds[row], "episode": numbers[row]}
+            return self._alone(row).reset(**how, do=asked, space=space)
 
         try:
             found = self._everywhere(rows, begin)
         except ScmWorldError as error:
             if not isinstance(error, EngineFailure):
-                self._everywhere(rows, lambda row: self._alone(row).reset(seed=seeds[row]))
+                self._everywhere(
+                    rows,
+                    lambda row: self._alone(row).reset(seed=seeds[row], episode=numbers[row]),
+                )
             raise
         return Audits({row: audit for row, audit in found.items() if audit is not None}, {})
 
-    def _begin_all(self, rows: Integers, seeds: Sequence[Any]) -> None:
+    def _begin_all(self, rows: Integers, seeds: Sequence[Any], numbers: Sequence[int]) -> None:
         """Begin an episode without interventions in some worlds, or in none of them."""
         back: list[Callable[[], None]] = []
-        alike = self._begins_alike()
+        alike = self.begins_alike()
         apart = [row for row in rows.tolist() if row in self._shown or not alike]
         try:
             self._everywhere(
                 np.array(apart, dtype=int),
-                lambda row: self._alone(row).reset(seed=seeds[row]),
+                lambda row: self._alone(row).reset(seed=seeds[row], episode=numbers[row]),
                 back,
             )
             if len(apart) < len(rows):
                 together = np.setdiff1d(rows, apart)
-                self._begin_together(together, [seeds[row] for row in together.tolist()], back)
+                each = [(seeds[row], numbers[row]) for row in together.tolist()]
+                self._begin_together(together, each, back)
         except BaseException:
             for undo in reversed(back):
                 undo()
             raise
 
-    def _begins_alike(self) -> bool:
+    def begins_alike(self) -> bool:
         """Return whether what is drawn at the beginning is numbers that move no body."""
         if any(variable.own_noise is not None for variable in self._structures.head.variables):
             return False
@@ -318,14 +403,17 @@ class Batch:
         return not moves and natural.composition.structural.isdisjoint(order)
 
     def _begin_together(
-        self, rows: Integers, seeds: Sequence[Any], back: list[Callable[[], None]]
+        self, rows: Integers, each: Sequence[tuple[Any, int]], back: list[Callable[[], None]]
     ) -> None:
-        """Begin an episode in worlds that begin alike; see ``Simulation._begin``."""
+        """Begin an episode in worlds that begin alike; see ``Simulation._begin``.
+
+        ``each`` has the seed and the number of the episode of each world.
+        """
         natural, engine = self._structures.natural(None), self._engine
         where, own, built = self._where[rows], list[int](), self._built[rows]
         where[:, 2] = 0
         lost = np.zeros(len(rows), bool)
-        for place, (row, seed) in enumerate(zip(rows.tolist(), seeds, strict=True)):
+        for place, (row, (seed, number)) in enumerate(zip(rows.tolist(), each, strict=True)):
             world, there = self._worlds[row], self._done[row] is not None
             if world is not None:
                 built[place] = there = world.has_begun
@@ -335,7 +423,8 @@ class Batch:
                 own.append(CompiledNoise(seed).seed)
             else:
                 own.append(self._seeds[row] if there else secrets.randbits(63))
-            where[place, 1] = where[place, 1] + np.uint64(1) if there and seed is None else 0
+            following = where[place, 1] + np.uint64(1) if there else 0
+            where[place, 1] = following if seed is None else number
         where[:, 0] = [word_of(f"seed {seed}") for seed in own]
         fresh, again, kept = rows[~built], rows[built], rows[built & ~lost]
         if kept.size:
@@ -353,7 +442,7 @@ class Batch:
             engine.restore(again, [origin.engine])
         numbers = np.repeat(origin.row.numbers[None], len(rows), axis=0)
         numbers[:, natural.fresh] = 0.0
-        one = SharedTransaction(self._structures, origin.structure, natural, numbers, where, own)
+        one = RowMemory(self._structures, origin.structure, natural, numbers, where, own)
         if natural.random:
             self._draw_nature(rows, one, numbers, beginnings(natural, first, where, one.key))
         number = self._number((natural, physics_steps(self._structures.options, origin.structure)))
@@ -372,29 +461,16 @@ class Batch:
         self._gone.difference_update(rows.tolist())
         self._take(one, rows, np.arange(len(rows)), table)
 
-    def _draw_nature(
-        self, rows: Integers, one: SharedTransaction, numbers: Floats, then: Floats
-    ) -> None:
+    def _draw_nature(self, rows: Integers, one: RowMemory, numbers: Floats, then: Floats) -> None:
         """Change worlds that begin to what is drawn in them; see ``Simulation._draw_nature``."""
-        compiled, engine = one.compiled, self._engine
-        layout, size = compiled.composition.system.layout, compiled.state_size
-        moves = (numbers[:, :size] != then[:, :size]) & layout.can_be_set
-        taken = (moves & layout.engine_takes).any(axis=1)
-        names = [name for name in compiled.static_names if name in compiled.parameter_keys]
-        parts = [
-            (numbers[:, at] != then[:, at]).any(axis=1) for at in map(compiled.where.get, names)
-        ]
-        patterns, of = np.unique(np.array([*parts, taken]), axis=1, return_inverse=True)
-        for number, pattern in enumerate(patterns.T):
-            places = np.flatnonzero(of.ravel() == number)
-            changed = [name for name, is_one in zip(names, pattern, strict=False) if is_one]
-            values = Rows(compiled, then[places])
-            parameters = {compiled.parameter_keys[name]: values[name] for name in changed}
-            if parameters or pattern[-1]:
-                states = then[places, :size] if pattern[-1] else None
-                engine.apply(rows[places], parameters, states)
+        compiled, size = one.compiled, one.compiled.state_size
+        for places, changed, moved in changes(compiled, numbers, then)[0]:
+            parameters = _parameters(Rows(compiled, then), changed, places)
+            if parameters or moved:
+                states = then[places, :size] if moved else None
+                self._engine.apply(rows[places], parameters, states)
         numbers[:] = then
-        numbers[:, :size] = engine.read(rows)
+        numbers[:, :size] = self._engine.read(rows)
         numbers[:, compiled.fresh] = 0.0
 
     def _check(self, table: Rows, fresh: Integers) -> None:
@@ -414,38 +490,6 @@ class Batch:
             check_functions(compiled, table.row(row))
         warn_of_start(table.row(int(fresh[0])), stacklevel=6)
 
-    def do(
-        self,
-        request: Mapping[str, Any],
-        *,
-        where: Any = None,
-        space: AnyRegion | None = None,
-        on_refusal: Literal["raise", "skip"] = "raise",
-    ) -> Audits:
-        """Intervene now in all selected worlds; see ``Simulation.do``.
-
-        Parameters that move no body are set, or drawn from boxes, in all rows at once; other
-        interventions are computed in one world after another. Both give the same bits.
-
-        Args:
-            request: Values or interventions by name. A value with a leading axis of n worlds, as
-                such or in a ``Hard``, gives one value to each world; others apply to all.
-            where: Boolean mask of the worlds, shape (n,); all if None.
-            space: Space in which every target must lie.
-            on_refusal: With ``"raise"``, no world changes if one of them refuses. With
-                ``"skip"``, those that refuse are unchanged and are listed in ``refused``.
-
-        Returns:
-            The audits by number of the world.
-
-        Raises:
-            InterventionError: It was refused; the message names the world. Nothing has changed.
-            NotReset: No episode has begun in one of the worlds.
-        """
-        one_of("on_refusal", on_refusal, ("raise", "skip"))
-        rows = np.flatnonzero(read_mask("where", where, len(self)))
-        return self._do(request, rows, space, skips=on_refusal == "skip")
-
     def _do(
         self,
         request: Mapping[str, Any],
@@ -455,7 +499,7 @@ class Batch:
         skips: bool = False,
     ) -> Audits:
         flat = flatten(request)
-        ready: list[tuple[SharedTransaction, Integers, Rows]] = []
+        ready: list[tuple[RowMemory, Integers, Rows]] = []
         alone: list[int] = []
         alike: dict[Any, list[int]] = {}
         now = self.index == self._where[:, 2]
@@ -488,9 +532,9 @@ class Batch:
             raise
         for one, members, table in ready:
             places = np.setdiff1d(np.arange(len(members)), one.refused)
-            which, numbers = members[places], one.numbers[places]
-            table.numbers[which] = numbers
-            moved = which[one.changed[places].any(axis=1)]
+            which, differ = members[places], places[one.differs[places]]
+            moved = members[differ]
+            table.numbers[moved] = one.numbers[differ]
             table.numbers[moved, one.compiled.fresh] = 0.0
             if one.at_start and len(moved):
                 table.remember(moved)
@@ -500,7 +544,7 @@ class Batch:
 
     def _together(
         self, request: Mapping[str, Any], members: Integers, space: AnyRegion | None
-    ) -> tuple[SharedTransaction, Integers, Rows] | None:
+    ) -> tuple[RowMemory, Integers, Rows] | None:
         """Compute an intervention in worlds that are alike; None if each has to do it alone."""
         below: Any = self._done[members[0]]
         compiled = below.compiled
@@ -515,66 +559,70 @@ class Batch:
         where[:, 2] = now[:, compiled.clock]
         seeds = [self._seeds[row] for row in members.tolist()]
         before = below, self._place[members]
-        one = SharedTransaction(
-            self._structures, below.structure, compiled, now, where, seeds, before
-        )
+        one = RowMemory(self._structures, below.structure, compiled, now, where, seeds, before)
         region = self._first.variables_space if space is None else as_region("space", space)
         return (one, members, table) if one.ask(named, values, region) else None
 
-    def _take(self, one: SharedTransaction, rows: Integers, places: Integers, table: Rows) -> None:
+    def _take(self, one: RowMemory, rows: Integers, places: Integers, table: Rows) -> None:
         """Note what worlds have done together; their rows have the values already."""
         for row in rows.tolist():
             self._done[row] = one
         self._place[rows] = places
         self._where[rows] = one.where[places]
         self._changes += 1
-        commands = one.compiled.composition.commands
+        self._acts_alone[rows], commands = False, one.compiled.composition.commands
         if commands is not None:
             self._acts_alone[rows] = commands.applies(Rows(one.compiled, table.numbers[rows]))
-        if self._names:
-            table.evaluate(self._names, rows)
+        if self.names:
+            table.evaluate(self.names, rows)
 
     def _write(
-        self, one: SharedTransaction, members: Integers, table: Rows, back: list[Callable[[], None]]
+        self, one: RowMemory, members: Integers, table: Rows, back: list[Callable[[], None]]
     ) -> list[tuple[Integers, Callable[[int], Audit]]]:
         """Change the engine for worlds that intervene together; see ``Simulation._commit``.
 
         Returns:
             Their numbers, and what makes the audit of each; see ``Audits``.
         """
-        compiled, taken = one.compiled, np.ones(len(members), bool)
-        keys, known, taken[one.refused] = compiled.parameter_keys, compiled.inertias, False
-        wanted = {keys[name] for name in one.asked if name in keys}
+        compiled, size = one.compiled, one.compiled.state_size
+        keys, known, targets = compiled.parameter_keys, compiled.inertias, compiled.model.targets
+        wanted = {keys[t] for name in one.asked for t in targets(name) if t in keys}
         old, new = Rows(compiled, table.numbers[members]), Rows(compiled, one.numbers)
+        layout = compiled.composition.system.layout
+        settable, kept = layout.can_be_set, layout.can_be_set & ~layout.engine_takes
         remarked = self._first.backend.capabilities.remarks
         audits: list[tuple[Integers, Callable[[int], Audit]]] = []
-        patterns, of = np.unique(one.changed, axis=0, return_inverse=True)
-        for number, pattern in enumerate(patterns):  # nearly always the same in all of them
-            places = np.flatnonzero(taken & (of.ravel() == number))
-            which = members[places]
-            changed = [n for n, is_one in zip(one.names, pattern, strict=True) if is_one]
-            before, then = (
-                {keys[n]: row[n][places] for n in changed if n in keys} for row in (old, new)
-            )
+        is_moved = False
+        for group, changed, moved in one.groups:
+            places = np.setdiff1d(group, one.refused) if one.refused else group
             if not len(places):
                 continue
+            which = members[places]
+            before, then = (_parameters(each, changed, places) for each in (old, new))
+            left, states = (each.numbers[places, :size] if moved else None for each in (old, new))
             inertia = self._engine.parameters(which, sorted({known[k] for k in then if k in known}))
             others = np.ones(len(which), bool)
             try:
-                if then:
-                    self._engine.apply(which, then)
+                if then or moved:
+                    self._engine.apply(which, then, states)
             except ScmWorldError as error:
                 others = ~np.isin(which, error.scenes)
                 raise located(error, error.scenes[0], "world") from error.__cause__
             finally:  # these have changed
                 values = {key: value[others] for key, value in before.items()}
-                back.append(partial(self._engine.apply, which[others], values))
+                earlier = None if left is None else left[others]
+                back.append(partial(self._engine.apply, which[others], values, earlier))
             reported = self._engine.parameters(which, {*wanted, *then, *inertia})
-            for key, value in then.items():
-                near = np.isclose(reported[key], value, READ_BACK, READ_BACK)
+            found = {".".join(key): (value, reported[key]) for key, value in then.items()}
+            if states is not None:
+                read = np.where(kept, states, self._engine.read(which))
+                found["the state"] = states[:, settable], read[:, settable]
+                one.numbers[places, :size], is_moved = read, True
+            for name, (value, got) in found.items():
+                near = np.isclose(got, value, READ_BACK, READ_BACK)
                 if not near.all():
                     first = which[~near.reshape(len(which), -1).all(axis=1)][0]
-                    said = f"the engine did not take over {'.'.join(key)}"
+                    said = f"the engine did not take over {name}"
                     raise located(EngineFailure(said, self._first.backend.name), first, "world")
             remarks: list[tuple[str, ...]] = []
             for at, row in enumerate(which.tolist()):
@@ -584,6 +632,7 @@ class Batch:
                 was = {key: value[at] for key, value in before.items()}
                 remarks.append(backend.capabilities.remarks(backend, was))
             audits.append((which, partial(one.audit, places, inertia, reported, remarks)))
+        one.states = one.numbers[:, :size].copy() if is_moved else None
         return audits
 
     def _request(self, row: int, flat: Mapping[str, Any]) -> dict[str, Any]:
@@ -623,7 +672,7 @@ class Batch:
                 raise
         return found
 
-    def step(self, actions: ArrayLike, *, where: Any = None) -> None:
+    def step(self, actions: ArrayLike, *, where: Mask | None = None) -> None:
         """Advance some worlds one control step.
 
         Args:
@@ -640,7 +689,9 @@ class Batch:
         mask = read_mask("where", where, len(self))
         shape = len(self), self._first.compiled.n_actions
         given = read_actions(actions, mask, shape, "world")
-        each: Any = {row: self._worlds[row] for row in self._existing(np.flatnonzero(mask))}
+        each: dict[int, Any] = {
+            row: self._worlds[row] for row in self._existing(np.flatnonzero(mask))
+        }
         due = [row for row, one in each.items() if one.is_planned and one._may_act(one.index)]
         if due:
             self._everywhere(np.array(due), lambda row: each[row].act())
@@ -659,20 +710,13 @@ class Batch:
         self._shown.add(row)
         return self._alone(row)
 
-    def _numbered(self, index: int) -> int:
-        row = whole_number("world", index, least=0)
-        if row >= len(self):
-            allowed = (f"any whole number from 0 to {len(self) - 1}",)
-            raise UnknownOption("world", index, allowed)
-        return row
-
     @typed
     def table(self, index: int) -> Rows:
         """Return the rows of all worlds with the structure of one world."""
         index = self._numbered(index)
-        return self._by_structure(self._all[index : index + 1])[0][0]
+        return self.by_structure(self._all[index : index + 1])[0][0]
 
-    def _by_structure(self, rows: Integers) -> list[tuple[Rows, Integers]]:
+    def by_structure(self, rows: Integers) -> list[tuple[Rows, Integers]]:
         """Return the rows of some worlds by structure, with the numbers of these worlds."""
         return [(self._tables[kind[0]], members) for kind, members in self._groups(rows)]
 
@@ -701,9 +745,7 @@ class Batch:
         groups, sent = self._groups(rows), commands
         held: dict[int, Held] = {}
         late: Mapping[int, Floats] = within
-        there: Any = self._worlds
-        alone = [row for row in self._existing(rows) if there[row].acts_alone]
-        alone += rows[self._acts_alone[rows]].tolist()
+        alone = rows[self._acts_alone[rows]].tolist()
         if alone:
             others = np.setdiff1d(rows, alone)
             commands, sent, late, held = self._decide(alone, others, commands, within)
@@ -736,7 +778,7 @@ class Batch:
         if failed is not None:
             raise failed
         for (compiled, _), members in groups:
-            self._tables[compiled].evaluate(self._names, members)
+            self._tables[compiled].evaluate(self.names, members)
 
     def _decide(
         self, alone: list[int], others: Integers, commands: Floats, within: Mapping[int, Floats]
@@ -813,13 +855,13 @@ class Batch:
 
     def _groups(self, rows: Integers) -> list[tuple[tuple[CompiledTask, int], Integers]]:
         """Group worlds by structure and number of physics steps; fill the rows of changed ones."""
-        there: Any = self._worlds
+        there: Sequence[Any] = self._worlds
         changed = [n for n in self._existing(rows) if there[n].version != self._versions[n]]
         for row in changed:
             self._fill(row)
         if changed:
             for (compiled, _), members in self._by_kind(np.array(changed)):
-                self._tables[compiled].evaluate(self._names, members)
+                self._tables[compiled].evaluate(self.names, members)
             for row in changed:
                 self._versions[row] = there[row].version
         return self._by_kind(rows)
@@ -837,6 +879,7 @@ class Batch:
         world = self._alone(row)
         world._require_episode()
         self._kind[row] = self._number((world.compiled, world.substeps))
+        self._acts_alone[row] = world.acts_alone
         table = self._tables[world.compiled]
         if world.row.numbers.base is not table.numbers:
             world.move(table.row(row))
@@ -855,19 +898,13 @@ class Batch:
             self._tables = {one: table for one, table in tables.items() if table is not None}
         return self._kinds.index(kind)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def __reduce__(self) -> tuple[Any, ...]:
         """Return the parts for copying and pickling."""
         if self._options is None:
-            return partial(type(self), threads=self._threads, names=self._names), (self._worlds,)
+            return partial(type(self), threads=self.threads, names=self.names), (self._worlds,)
         begun = {row: self._alone(row) for row in np.flatnonzero(self._kind >= 0).tolist()}
         saved = {row: world.snapshot() for row, world in begun.items() if world.has_begun}
-        given = self._options, len(self), self._threads, self._names
+        given = self._options, len(self), self.threads, self.names
         return _copied, (type(self), saved, self._first, *given)
 
     def close(self) -> None:
@@ -887,6 +924,11 @@ def _copied(kind: type[Batch], saved: Mapping[int, Snapshot], *given: Any) -> Ba
     return made
 
 
+def _parameters(rows: Rows, names: Iterable[str], places: Integers) -> dict[Any, Value]:
+    keys = rows.compiled.parameter_keys
+    return {keys[name]: rows[name][places] for name in names if name in keys}
+
+
 # --- arguments of many worlds ---------------------------------------------------------------------
 
 
@@ -896,7 +938,7 @@ def located(error: ScmWorldError, index: int, what: str) -> ScmWorldError:
     return error
 
 
-def read_seeds(seed: Any, size: int) -> list[Any]:
+def read_seeds(seed: object, size: int) -> list[Any]:
     """Return the seed of each world; one seed counts up."""
     if seed is None:
         return [None] * size
@@ -906,6 +948,14 @@ def read_seeds(seed: Any, size: int) -> list[Any]:
     if len(seed) != size:
         raise UnknownOption("seed", seed, ("a whole number", f"a list of {size} of them or None"))
     return [*seed]
+
+
+def read_numbers(episode: Any, size: int) -> list[int]:
+    """Return the number of the episode of each world; one number is that of all."""
+    each = [*episode] if np.ndim(episode) else [episode] * size
+    if len(each) != size:
+        raise UnknownOption("episode", episode, ("a whole number", f"a list of {size} of them"))
+    return [whole_number("episode", number, least=0, most=EPISODES) for number in each]
 
 
 def values_of_each(model: SCM, request: Mapping[str, Any], count: int) -> dict[str, Any]:
@@ -931,18 +981,20 @@ def of_row(
     return found
 
 
-def read_mask(name: str, mask: Any, size: int) -> Mask:
+def read_mask(name: str, mask: object, size: int) -> Mask:
     """Return a checked boolean mask of worlds; all if None."""
     if mask is None:
         return np.ones(size, bool)
-    read = isinstance(mask, np.ndarray) and mask.shape == (size,) and mask.dtype == np.bool_
-    if not (read and mask.any()):
+    is_array = isinstance(mask, np.ndarray) and mask.dtype == np.bool_ and mask.shape == (size,)
+    if not is_array or not np.asarray(mask).any():
         allowed = (f"an array of {size} truth values, at least one of them true",)
         raise UnknownOption(name, mask, allowed)
     return np.array(mask)
 
 
-def read_actions(actions: Any, which: Mask | None, shape: tuple[int, int], what: str) -> Floats:
+def read_actions(
+    actions: ArrayLike, which: Mask | None, shape: tuple[int, int], what: str
+) -> Floats:
     """Return the checked actions of all worlds, of which ``which`` are stepped, in a shape.
 
     A world is called ``what`` in errors.

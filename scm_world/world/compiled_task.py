@@ -337,7 +337,8 @@ class CompiledTask(Vectors):
             columns.append(self._take(np.size(value)))
             self._written.append((columns[-1], value))
         where = [(at.start, at.stop) for at in (*columns, self.where[name])]
-        return [*steps, CompiledStep(found, np.array(where), called)]
+        vectors = (*(kind == VECTOR for kind in kinds), variable.shape != ())
+        return [*steps, CompiledStep(found, np.array(where), called, vectors)]
 
     def needed(self, names: Iterable[str]) -> tuple[str, ...]:
         """List the computed variables on which some names and the memory depend, causes first."""
@@ -361,6 +362,18 @@ class CompiledTask(Vectors):
             steps = [step for name in wanted for step in self._steps[name]]
             found = self._programs[names] = program_of([*steps, *self._mark])
         return found
+
+    @property
+    def constants(self) -> dict[int, float]:
+        """The values of columns that have the same one in all worlds, by column."""
+        found: dict[int, float] = {}
+        for place, value in self._written[1:]:
+            found |= zip(range(place.start, place.stop), np.ravel(value).tolist(), strict=True)
+        return found
+
+    def steps_of(self, name: str) -> list[Step]:
+        """Return the steps that compute a variable from others, last what marks that it is done."""
+        return self._steps[name]
 
     @property
     def plan(self) -> Plan:
@@ -416,8 +429,9 @@ class CompiledTask(Vectors):
         And, grouped by size, names, streams, columns, lower ends and edges, the last three of shape
         (draws, size).
         """
-        if draws in self._boxes:
-            return self._boxes[draws]
+        found = self._boxes.get(draws)
+        if found is not None:
+            return found
         sizes = dict[int, list[Any]]()
         for name, source, stream in draws:
             box = self._box(name, source)
@@ -427,8 +441,8 @@ class CompiledTask(Vectors):
         groups = [(*zip(*group, strict=True),) for group in sizes.values()]
         if len(self._boxes) == BOXES:
             self._boxes.clear()
-        self._boxes[draws] = names, [(*g[:2], *map(np.stack, g[2:])) for g in groups]
-        return self._boxes[draws]
+        found = self._boxes[draws] = names, [(*g[:2], *map(np.stack, g[2:])) for g in groups]
+        return found
 
     def _box(self, name: str, source: Any) -> tuple[Integers, Floats, Floats] | None:
         """Return columns, lower ends and edges; None for a source that exceeds the bounds."""
@@ -588,7 +602,7 @@ def beginning(
 
 
 def beginnings(
-    compiled: CompiledTask, first: Rows, where: Any, key: Callable[[int], NoiseKey]
+    compiled: CompiledTask, first: Rows, where: NDArray[np.uint64], key: Callable[[int], NoiseKey]
 ) -> Floats:
     """Return the rows of several worlds at the beginning of episodes, shape (n, width).
 

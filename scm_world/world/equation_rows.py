@@ -7,23 +7,25 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from copy import copy, deepcopy
 from functools import partial
-from typing import Any, Literal, Self, final
+from typing import Any, final
 
 import numpy as np
 
 from scm_world._arguments import one_of, typed, whole_number
 from scm_world._types import ArrayLike, Floats, Integers, Mask, Value
-from scm_world.errors import FunctionFailure, InterventionError, ScmWorldError, UnknownOption
+from scm_world.errors import FunctionFailure, InterventionError, ScmWorldError
 from scm_world.graph import flatten
 from scm_world.graph.scm import request_of
 from scm_world.variables.interventions import has_times
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world.audit import Applied, Audit, Audits
 from scm_world.world.batch import (
+    WorldsInRows,
     located,
     of_row,
     read_actions,
     read_mask,
+    read_numbers,
     read_seeds,
     values_of_each,
 )
@@ -35,7 +37,7 @@ Part = tuple[Equations, Integers]
 """Equations of some worlds, and the numbers of these."""
 
 
-class EquationBatch:
+class EquationBatch(WorldsInRows):
     """Worlds of one causal model, each with its own noise, clock and interventions; see ``Batch``.
 
     Worlds at the same control step, under interventions on the same variables, are solved together
@@ -84,9 +86,7 @@ class EquationBatch:
         """
         return self._gathered((self._one.model.declared(name).name,), self._all)[name]
 
-    def values(self, *, where: Any = None) -> dict[str, Value]:
-        """Return the present values of all variables in the selected worlds; see ``Batch``."""
-        rows = np.flatnonzero(read_mask("where", where, len(self)))
+    def _values(self, rows: Integers) -> dict[str, Value]:
         return self._gathered(tuple(self._one.model), rows)
 
     def _gathered(self, names: tuple[str, ...], rows: Integers) -> dict[str, Value]:
@@ -117,9 +117,7 @@ class EquationBatch:
 
     def world(self, index: int) -> Equations:
         """Return a world by its number, or raise ``UnknownOption``; it is solved alone then."""
-        if whole_number("world", index, least=0) >= len(self):
-            allowed = (f"any whole number from 0 to {len(self) - 1}",)
-            raise UnknownOption("world", index, allowed)
+        index = self._numbered(index)
         at = next(i for i, (_, members) in enumerate(self._parts) if index in members)
         part, members = self._parts.pop(at)
         if part.is_several:
@@ -137,20 +135,22 @@ class EquationBatch:
         self,
         *,
         seed: int | Sequence[int | None] | None = None,
-        where: Any = None,
+        episode: int | Sequence[int] = 0,
+        where: Mask | None = None,
         do: Mapping[str, Any] | None = None,
         space: AnyRegion | None = None,
     ) -> Audits:
         """Begin an episode in all selected worlds; see ``Batch.reset``."""
         mask, request = read_mask("where", where, len(self)), request_of(do)
-        seeds, numbers = read_seeds(seed, len(self)), np.zeros(len(self), dtype=np.uint64)
+        seeds = read_seeds(seed, len(self))
+        numbers = np.array(read_numbers(episode, len(self)), dtype=np.uint64)
         for part, members in self._parts if any(one is None for one in seeds) else ():
             now = zip(members.tolist(), part.seeds, np.ravel(part.episode), strict=True)
             for row, old, number in now:
                 if seeds[row] is None and part.has_begun:
                     seeds[row], numbers[row] = old, number + 1
                 elif seeds[row] is None:
-                    seeds[row] = secrets.randbits(63)
+                    seeds[row], numbers[row] = secrets.randbits(63), 0
 
         def begin(asked: Mapping[str, Any]) -> Callable[[Equations, Integers], Audit | None]:
             def act(part: Equations, members: Integers) -> Audit | None:
@@ -167,24 +167,20 @@ class EquationBatch:
             self._change(mask, begin({}))
             raise
 
-    def do(
+    def _do(
         self,
         request: Mapping[str, Any],
+        rows: Integers,
+        space: AnyRegion | None,
         *,
-        where: Any = None,
-        space: AnyRegion | None = None,
-        on_refusal: Literal["raise", "skip"] = "raise",
+        skips: bool = False,
     ) -> Audits:
-        """Intervene now in all selected worlds; see ``Batch.do``."""
-        one_of("on_refusal", on_refusal, ("raise", "skip"))
-
         def act(part: Equations, members: Integers) -> Audit:
             return part.do(self._request(request, members, several=part.is_several), space=space)
 
-        mask = read_mask("where", where, len(self))
-        return self._change(mask, act, request_of(request), skips=on_refusal == "skip")
+        return self._change(np.isin(self._all, rows), act, request_of(request), skips=skips)
 
-    def step(self, actions: ArrayLike, *, where: Any = None) -> None:
+    def step(self, actions: ArrayLike, *, where: Mask | None = None) -> None:
         """Advance some worlds one control step.
 
         Args:
@@ -247,15 +243,15 @@ class EquationBatch:
                     one, rows = todo.pop(0)
                     before = copy(one)
                     try:
-                        audit = _changed(one, rows, act, skips=skips)
-                    except InterventionError as error:
-                        if not skips:
-                            raise
+                        audit = act(one, rows)
+                    except ScmWorldError as error:
                         if one.is_several:  # each answers for itself
                             todo = self._singles(before, rows) + todo
-                        else:
+                        elif skips and isinstance(error, InterventionError):
                             refused[int(rows[0])] = error
                             parts.append((one, rows))
+                        else:
+                            raise located(error, int(rows[0]), "world") from error.__cause__
                         continue
                     parts.append((one, rows))
                     if audit is not None:
@@ -308,12 +304,6 @@ class EquationBatch:
         return [*(one for one, is_lone in zip(parts, lone, strict=True) if is_lone), *merged(free)]
 
     # --- the whole ------------------------------------------------------------------------------
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """End the episodes of all worlds; there is no engine to free."""
@@ -424,7 +414,7 @@ class EquationTable:
         found: Mask = (versions == self._versions) & (indices == known)
         return found
 
-    def _by_structure(self, rows: Integers) -> list[tuple[Rows, Integers]]:
+    def by_structure(self, rows: Integers) -> list[tuple[Rows, Integers]]:
         """Return the rows of all worlds, and the numbers of some of them."""
         if not len(rows):
             return []
@@ -470,28 +460,6 @@ def _split(part: Equations, members: Integers, mask: Mask) -> tuple[list[Part], 
         [(part.of(np.flatnonzero(taken)), members[taken])] for taken in (inside, ~inside)
     )
     return chosen, other
-
-
-def _changed(
-    part: Equations,
-    members: Integers,
-    act: Callable[[Equations, Integers], Audit | None],
-    *,
-    skips: bool = False,
-) -> Audit | None:
-    """Change worlds; an error is that of the first world that refuses alone, and names it."""
-    before = copy(part)
-    try:
-        return act(part, members)
-    except ScmWorldError as error:
-        if skips and isinstance(error, InterventionError):
-            raise
-        for at in range(len(members) if part.is_several else 0):
-            try:
-                act(before.of(np.array([at]), alone=True), members[at : at + 1])
-            except ScmWorldError as own:
-                raise located(own, int(members[at]), "world") from error
-        raise located(error, int(members[0]), "world") from error.__cause__
 
 
 def _of_row(audit: Audit, place: int, asked: Callable[[], Mapping[str, Any]]) -> tuple[Any, ...]:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import chain
 from typing import Any, NamedTuple, final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from scm_world._types import Value
+from scm_world._types import Floats, Value
 from scm_world.errors import (
     ClosesCycle,
     ConflictingTargets,
@@ -18,6 +19,7 @@ from scm_world.errors import (
     InterventionError,
     NotIntervenable,
     OutOfBounds,
+    ScmWorldError,
     UnknownVariable,
     WrongValue,
     in_one_line,
@@ -118,12 +120,15 @@ class Transaction:
         relative: Shifts and scales by the numbers that were drawn for them, by requested name.
         model: The model with the interventions that would be in force, draws among them.
         problems: The errors that do not depend on draws.
+        order: The targets among the parameters and what follows from them, causes first.
+        draws: The targets that are drawn.
         attempts: The attempt of each draw beneath what is asked, by variable; see ``stacked``.
     """
 
     row: Rows
     change: Difference | None = None
     attempts: Mapping[str, int] | None = None
+    _own: frozenset[str] = frozenset()  # targets on which each of several rows has its own
 
     def __init__(
         self,
@@ -151,11 +156,11 @@ class Transaction:
         moving = self._refused_mechanisms(computing) if computing else {}
         self.problems += {problem.variable: problem for problem in moving.values()}.values()
         self._impossible = {*moving}  # what has no possible value
-        self._boxes: Any = (), ()  # draws from boxes that follow nothing; see ``boxes``
-        self._draws: list[str] = []
+        self._boxes: tuple[Any, Any] = (), ()  # draws from boxes that follow nothing; see ``boxes``
+        self.draws: list[str] = []
         self.changed: list[str] = []
         self._targets: tuple[str, ...] = ()
-        self._order: tuple[str, ...] = ()
+        self.order: tuple[str, ...] = ()
         if len(self._states) < len(self.acts):
             self._mutilate({t: named for t, named in self.acts.items() if t not in by_hand})
         self._always_impossible = frozenset(self._impossible)
@@ -244,13 +249,13 @@ class Transaction:
         out.update(*[problem.cycle for problem in cycles])
         static = compiled.static
         self._targets = tuple([t for t in acts if t in static and t not in out])
-        self._draws = [target for target in draws if target in self._targets]
+        self.draws = [target for target in draws if target in self._targets]
         if self.model.adds_edges:
             structure = self.model.structure
             follow = {*self._targets, *structure.instant_descendants(self._targets)}
-            self._order = tuple(n for n in structure.order if n in follow and n in static)
+            self.order = tuple(n for n in structure.order if n in follow and n in static)
         else:
-            self._order = compiled.static_order(self._targets)
+            self.order = compiled.static_order(self._targets)
 
     def _refused_mechanisms(self, computing: list[str]) -> dict[str, InterventionError]:
         """Return an error for each mechanism with a moving parent, or that fails now."""
@@ -315,7 +320,7 @@ class Transaction:
             numbers[columns] = low + edges * found
         self.row.unknown.difference_update(drawn)
         bounded, acts = self.compiled.bounded, self.acts
-        for name in self._order:
+        for name in self.order:
             if name in drawn:
                 continue
             asked, act = acts.get(name, (name, None))
@@ -325,7 +330,7 @@ class Transaction:
                 self.row[name] = constant  # it has been checked
             else:
                 self._compute(name, follows=name in bounded)
-        carries = not self.compiled.carriers.isdisjoint(self._order)
+        carries = not self.compiled.carriers.isdisjoint(self.order)
         if (carries or self._states or self.base.fresh) and self._impossible.isdisjoint(
             self._deciding
         ):
@@ -338,6 +343,82 @@ class Transaction:
         self.change = difference(now, self.row, self.changed)
         return []
 
+    def obstacles(self, now: Base, draws: Collection[str]) -> list[Any]:
+        """List overlaps deeper than those that physics left; or where draws may not put a body."""
+        found: list[Any] = []
+        if self.change is not None:
+            found = overlaps(self.base, now, self.row, self.change, self.asked)
+        composition = self.compiled.composition
+        if composition.kept_clear and draws and not found:  # of values, all are allowed
+            varied = self.compiled.reached(draws)
+            if not composition.kept_clear.isdisjoint(varied):
+                found = [*composition.obstructed(self.compiled.scene(self.row), varied)]
+        return found
+
+    def solve_rows(
+        self,
+        bases: Rows,
+        now: Rows,
+        where: NDArray[np.uint64],
+        key: Callable[[int], NoiseKey],
+        own: Mapping[str, Any],
+        alone: Callable[[int], Transaction],
+    ) -> tuple[Floats, list[int]]:
+        """Solve for worlds that differ in their numbers and their noise only.
+
+        Args:
+            bases: Their rows as physics left them.
+            now: Their present rows.
+            where: The key of the seed, the episode and the control step of each, shape (m, 3).
+            key: Returns the noise key of one of them.
+            own: What each has of its own, by target: values, shape (m, *shape), or interventions,
+                shape (m,).
+            alone: Computes what one of them does alone, drawing again where bodies overlap.
+
+        Returns:
+            The rows afterwards, shape (m, width), and the places of those that refuse it.
+        """
+        numbers, acts = bases.numbers.copy(), dict(self.acts)
+        drawn, groups = self._boxes
+        found = Rows(self.compiled, numbers)
+        constants: dict[str, Any] = {t: a.constant for t, (name, a) in acts.items() if name == t}
+        constants |= {t: None if one.dtype == object else one for t, one in own.items()}
+        free = {*drawn, *(t for t, one in constants.items() if one is not None)}
+        special = (self.compiled.bounded, self.compiled.material, self.compiled.carriers)
+        plain = free.issuperset(self.order) and all(s.isdisjoint(self.order) for s in special)
+        if plain and not (self._states or self.space):
+            for names, streams, columns, low, edges in groups:
+                words = [words_of(*one, range(1)) for one in zip(names, streams, strict=True)]
+                uniform = uniforms(where, np.concatenate(words), len(low[0]))
+                numbers[:, columns] = low + edges * uniform
+            for name in self.order:
+                if name not in drawn:
+                    found[name] = constants[name]
+            return numbers, []
+        refused, draws = list[int](), [n for n, act in acts.values() if act.root.draws]
+        self._own = frozenset(own)
+        for place in range(len(numbers)):
+            for target, each in own.items():
+                one = each[place]
+                act = one if isinstance(one, Intervention) else Hard.of(np.asarray(one))
+                self.acts[target] = target, act
+                if target in self.pending:
+                    self.pending[target] = target, act
+            self.base = replace(self.base, row=bases.row(place))
+            before = replace(self.base, row=now.row(place))
+            done = self
+            try:
+                wrong: Any = self.solve(key(place), before)
+                if not wrong and self.obstacles(before, draws):  # it draws again, or is refused
+                    done = alone(place)
+            except ScmWorldError:
+                wrong = True
+            if wrong or (done.change is not None and done.change.structure is not None):
+                refused.append(place)
+            else:
+                numbers[place] = done.row.numbers
+        return numbers, refused
+
     def _compute(self, name: str, *, follows: bool) -> None:
         """Compute a parameter after its parents; its bounds may depend on others."""
         variable, impossible = self.compiled.model.declared(name), self._impossible
@@ -345,7 +426,11 @@ class Transaction:
             impossible.add(name)
             return
         try:
-            value = self.model.evaluate(name, self.row, self._key)
+            applied = None
+            if name in self._own:
+                act = self.acts[name][1].on(self.model._beneath(name))
+                applied = self.model._applied(name, act)
+            value = self.model.evaluate(name, self.row, self._key, applied)
             if value.shape != variable.shape:  # of a mechanism that a user gave
                 raise WrongValue(name, value, variable.shape, np.shape(value))
             check_bounds(variable, value, self.row if follows else {})
@@ -361,7 +446,7 @@ class Transaction:
         for target in self._states:
             if target not in followed:
                 self._set_state(target)
-        moved = {*self._order, *self._states}
+        moved = {*self.order, *self._states}
         for name, parents in followed.items():
             if name in moved or name in fresh or not moved.isdisjoint(parents):
                 self._set_state(name)
@@ -506,7 +591,7 @@ class Transaction:
                 values = drawn[whole][:, first : first + values.size]
             elif act is not None and asked == name and act.constant is not None:
                 values = np.ravel(act.constant)
-            elif act is not None or name in self._order or name in compiled.set_parents:
+            elif act is not None or name in self.order or name in compiled.set_parents:
                 return None
             rows[name] = np.broadcast_to(values, (n, where[name].stop - where[name].start))
         return rows
@@ -544,7 +629,7 @@ class Transaction:
 
         Draws are their values there.
         """
-        drawn = dict([self.settled(target) for target in self._draws])
+        drawn = dict([self.settled(target) for target in self.draws])
         model = self.model._with_interventions(drawn) if drawn else self.model
         by_hand, actions = self.compiled.set_by_hand, self.compiled.actions
         found: PendingInterventions = {}
@@ -661,21 +746,14 @@ def feasible(
             wrong = done.solve(replace(key, attempt=attempt) if attempt else key, now)
             if wrong:
                 raise_all(wrong)
-            problems: list[Any] = []
-            if done.change is not None:
-                problems = overlaps(done.base, now, done.row, done.change, done.asked)
-            composition = done.compiled.composition
-            if composition.kept_clear and draws and not problems:  # of values, all are allowed
-                varied = done.compiled.reached(draws)
-                if not composition.kept_clear.isdisjoint(varied):
-                    problems = [*composition.obstructed(done.compiled.scene(done.row), varied)]
+            problems = done.obstacles(now, draws) if draws or done.change is not None else []
             if not problems:
                 return done
             tried = f"with the draws of episode {key.episode}, " if fixed else ""
             if draws:
                 tried = f"none of {ATTEMPTS:,} draws was feasible; in the last one "
             moved = {name.partition(".")[0] for name in done.compiled.reached(again)}
-            unmoved = {*composition.bodies} - moved
+            unmoved = {*done.compiled.composition.bodies} - moved
             if draws and (not again or any(unmoved.issuperset(o.bodies) for o in problems)):
                 tried = tried if deciding else "for every draw, "
                 break
@@ -754,8 +832,7 @@ def _nearest(
     for _ in range(20):
         middle = 0.5 * (low + high)
         done = Transaction(structures, base, between(middle), None, key)
-        blocked: Any = done.solve(key, now)  # outside the bounds, or in another body
-        if done.change is not None and not blocked:
-            blocked = overlaps(done.base, now, done.row, done.change, done.asked)
+        # Outside the bounds, or in another body:
+        blocked: Any = done.solve(key, now) or done.obstacles(now, ())
         low, high = (low, middle) if blocked else (middle, high)
     return between(low)[wanted]

@@ -15,7 +15,7 @@ from numba.core.errors import NumbaError
 from scm_world._types import ArrayLike, Floats, Integers, Value
 from scm_world.errors import FunctionFailure, ScmWorldError, in_one_line
 from scm_world.variables import Integers as WholeNumbers
-from scm_world.variables import Linear
+from scm_world.variables import Linear, Variable
 from scm_world.variables.mechanisms import PACKAGE, Stacked, Unboxed
 from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.world.kernels import begin_step, run, weighted_sum
@@ -166,11 +166,15 @@ class Rows(Mapping[str, Value]):
 @final
 @dataclass(frozen=True, eq=False)
 class CompiledStep:
-    """A step of a program; see ``run``. It keeps a reference to the function of its address."""
+    """A step of a program; see ``run``. It keeps a reference to the function of its address.
+
+    ``vectors`` says which of its arguments, and last its result, are vectors.
+    """
 
     addresses: tuple[int, int]
     where: Integers
     function: Any = None
+    vectors: tuple[bool, ...] = ()
 
 
 @final
@@ -181,6 +185,7 @@ class PythonStep:
         self, compiled: CompiledTask, name: str, variable: Any, columns: list[slice]
     ) -> None:
         self._variable, self._place = variable, compiled.where[name]
+        self.reads, self.writes = columns, self._place
         self._is_number = variable.shape == () and not variable.bounds
         self._clock = compiled.where[CONTROL_INDEX].start
         home = getattr(variable.equation, "reference", PACKAGE).partition(":")[0]
@@ -228,7 +233,7 @@ class PythonStep:
         return found
 
 
-def wrong_value(variable: Any, value: Any) -> str:
+def wrong_value(variable: Variable, value: object) -> str:
     """Return the error in a value that the function of a variable returned, or an empty text."""
     if type(value) is float and isfinite(value) and variable.shape == () and not variable.bounds:
         return ""

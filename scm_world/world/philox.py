@@ -6,17 +6,20 @@ Source:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any, final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world._types import Floats
+from scm_world._types import Floats, Integers
 from scm_world.geometry.numbers import njit
 from scm_world.variables import Noise
 from scm_world.variables.distributions import word_of
 from scm_world.variables.moments import NoiseKey, stream_of
+
+Words = NDArray[np.uint64]
 
 _MULTIPLIERS = np.uint64(0xD2E7470EE14C6C93), np.uint64(0xCA5A826395121157)
 _INCREMENTS = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBB67AE8584CAA73B)
@@ -24,7 +27,7 @@ _LOW, _HALF, _LAST, _ONE = np.uint64(0xFFFFFFFF), np.uint64(32), np.uint64(11), 
 
 
 @njit(cache=True)
-def _high(a: Any, b: Any) -> Any:
+def _high(a: np.uint64, b: np.uint64) -> np.uint64:
     """Multiply two words of 64 bits; return the upper 64 bits of the product."""
     a0, a1, b0, b1 = a & _LOW, a >> _HALF, b & _LOW, b >> _HALF
     middle = a1 * b0 + (a0 * b0 >> _HALF)
@@ -32,7 +35,7 @@ def _high(a: Any, b: Any) -> Any:
 
 
 @njit("void(u8[::1], u8[::1], f8[:, ::1])", cache=True)
-def philox(where: Any, keys: Any, out: Floats) -> None:
+def philox(where: Words, keys: Words, out: Floats) -> None:
     """Write the uniform numbers of several streams, as ``Noise.uniforms`` does for one episode.
 
     Args:
@@ -59,7 +62,7 @@ def philox(where: Any, keys: Any, out: Floats) -> None:
 
 
 @njit("void(u8[:, ::1], u8[::1], f8[:, :, ::1])", cache=True)
-def _philox_of_many(where: Any, keys: Any, out: Floats) -> None:
+def _philox_of_many(where: Words, keys: Words, out: Floats) -> None:
     for world in range(where.shape[0]):
         philox(where[world], keys, out[world])
 
@@ -116,8 +119,8 @@ class NoiseOfRows(Noise):
         count: Number of episodes.
     """
 
-    def __init__(self, seeds: Any, count: int) -> None:
-        given = [seeds] if np.ndim(seeds) == 0 else seeds
+    def __init__(self, seeds: int | Sequence[int], count: int) -> None:
+        given = seeds if isinstance(seeds, Sequence | np.ndarray) else [seeds]
         whole = [s if type(s) is int and s >= 0 else CompiledNoise(s).seed for s in given]
         seed = tuple(whole * count if len(whole) < count else whole)
         where = np.zeros((count, 3), dtype=np.uint64)
@@ -125,7 +128,7 @@ class NoiseOfRows(Noise):
         vars(self).update(seed=seed, where=where, at=None)
 
     def uniforms(
-        self, variable: str, *, n: int, episode: Any = 0, step: int = 0, count: int = 1
+        self, variable: str, *, n: int, episode: int | Integers = 0, step: int = 0, count: int = 1
     ) -> Floats:
         """Draw the uniform numbers of a variable, shape ``(count, n)``; ``episode`` has as many."""
         found, kept = np.empty((count, 1, n)), vars(self)

@@ -51,11 +51,11 @@ from scm_world.world.interventions import (
 from scm_world.world.mechanisms import Rows
 from scm_world.world.philox import CompiledNoise
 from scm_world.world.snapshot import Base, Snapshot
-from scm_world.world.structures import StructureCache
+from scm_world.world.structures import StructureCache, structures_of
 from scm_world.world.system import CausalSystem
 
 if TYPE_CHECKING:
-    from scm_world.world.shared_transaction import SharedTransaction
+    from scm_world.world.row_memory import RowMemory
 
 READ_BACK = 1e-6  # tolerance for numbers that a backend reports, relative and absolute
 
@@ -159,7 +159,7 @@ class Simulation(CausalSystem):
         if shared is not None and replace(shared.options, steps=0) != options:
             name, allowed = "options of a world with these structures", (str(shared.options),)
             raise UnknownOption(name, options, allowed)
-        self.structures = shared or StructureCache(kind, options)
+        self.structures = shared or structures_of(kind, options)
         self.deciding, self.policies = self.structures.deciding, kind.policies
         self.options = self.structures.options
         self._checked = False
@@ -536,7 +536,7 @@ class Simulation(CausalSystem):
         """The world at this control step before any intervention; None after a step."""
         return self._base if self.index - self._offset == self._base_step else None
 
-    def _go_on(self, one: SharedTransaction, place: int, row: Rows, origin: Snapshot) -> None:
+    def _go_on(self, one: RowMemory, place: int, row: Rows, origin: Snapshot) -> None:
         """Go on alone from what worlds did together; ``row`` has the present of this one."""
         key = one.key(place)
         self.noise, self.episode = CompiledNoise(key.noise.seed), key.episode
@@ -670,7 +670,8 @@ class Simulation(CausalSystem):
         acts = {name: model._act_on(name) for name in self.compiled.actions}
         roots = {name: act.root for name, act in acts.items() if act is not None}
         self.graph, self._held_actions = model, tuple(roots)
-        self.acts_alone = self._translates or bool(roots)
+        self.holds_actions = bool(roots)
+        self.acts_alone = self._translates or self.holds_actions
         follow = (of.intervention.follows(of.requested) for of in roots.values())
         self._inputs = tuple(p.name for parents in follow for p in parents)
 
@@ -748,7 +749,9 @@ class Simulation(CausalSystem):
             self.structures.task.on(other)
             other.build(self.structure.default_scene())
 
-        require_exact(self.backend, question, takes, independent=independent)
+        require_exact(
+            self.backend, question, takes, independent=self.structure if independent else None
+        )
 
     def require_state(self) -> None:
         """Refuse to continue without an episode, or from a state that the backend has lost."""
@@ -782,7 +785,9 @@ def _another(
     return kind(copy.copy(task) if structures is None else structures, **options)
 
 
-def _copied(kind: Any, task: Task, options: Mapping[str, Any], snapshot: Any) -> Any:
+def _copied(
+    kind: type[Simulation], task: Task, options: Mapping[str, Any], snapshot: Snapshot | None
+) -> Simulation:
     world = kind(task, **options)
     if snapshot is not None:
         world.restore(snapshot)

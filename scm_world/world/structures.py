@@ -8,6 +8,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import cached_property, lru_cache
 from typing import Any, final
+from weakref import WeakValueDictionary
 
 import networkx as nx
 
@@ -16,6 +17,7 @@ from scm_world._types import Values
 from scm_world.errors import InterventionError, ModelError, UnknownOption, UnknownVariable
 from scm_world.graph import SCM, NoiseKey
 from scm_world.tasks import Options, Task
+from scm_world.tasks.sources import TASKS
 from scm_world.variables import Intervention, Null
 from scm_world.variables.checks import check_bounds, coerce
 from scm_world.variables.reserved import CONTROL_INDEX
@@ -87,7 +89,7 @@ class StructureCache:
 
     def plan(self, values: Values) -> Plan:
         """Return the structure that follows from values of the head."""
-        return self.task.arrange(values) if len(self.head) else None, frozenset()
+        return self.task.arrange(values) if self.deciding else None, frozenset()
 
     def _compile(self, plan: Plan) -> CompiledTask:
         task = self.task.at(plan[0], self.options.conventions, plan[1])
@@ -98,7 +100,7 @@ class StructureCache:
 
     def natural(self, key: NoiseKey | None) -> CompiledTask:
         """Return the structure of an episode without interventions."""
-        values = self.head.solve(key=key) if len(self.head) else {}
+        values = self.head.solve(key=key) if self.deciding else {}
         return self.compiled(self.plan(values))
 
     def after(
@@ -132,6 +134,31 @@ class StructureCache:
         except InterventionError:
             return None
         return self.plan(values)
+
+
+_ALIVE: WeakValueDictionary[tuple[type[Task], Options], StructureCache] = WeakValueDictionary()
+
+
+def structures_of(task: Task, options: Options) -> StructureCache:
+    """Return the structures of a task.
+
+    They are those of another world that is there, if both have equal options and an equal task of
+    this package: nothing in those can change but their attributes, which are compared.
+    """
+    key = type(task), options
+    found = _ALIVE.get(key)
+    if found is None or not _alike(found.task, task.at(None, options.conventions)):
+        found = StructureCache(task, options)
+        if type(task) in TASKS.values():
+            _ALIVE[key] = found
+    return found
+
+
+def _alike(one: Task, other: Task) -> bool:
+    try:
+        return vars(one) == vars(other)
+    except ValueError:  # of arrays
+        return False
 
 
 @contextmanager

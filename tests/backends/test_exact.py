@@ -232,6 +232,7 @@ def test_a_wrapper_is_no_more_exact_than_its_engine() -> None:
         physics=False,
         floor=FLOOR,
         supports=Around.capabilities.supports,
+        rounding=Around.capabilities.rounding,
         remarks=Around.capabilities.remarks,
     )
     assert Around(make_backend("fake")).capabilities.floor == 0.0

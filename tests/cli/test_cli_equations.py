@@ -230,6 +230,7 @@ def test_files_and_objects_of_equations_are_systems(file: str, name: str) -> Non
     assert load("out4").truth is not None
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_what_a_learner_said_is_in_the_terminal(file: str) -> None:
     """A learner that fails: which one, on what, how often, and its own words in one line."""
     Path("troubled.py").write_text(

@@ -139,7 +139,7 @@ def test_explain_names_the_options_that_choose(results: Evaluation) -> None:
 def test_an_agent_of_another_task_is_told() -> None:
     """A policy that was trained for another task acts, with a warning."""
     with pytest.warns(UserWarning, match="'picking' was trained for the task 'picking'"):
-        evaluate("zoo:picking", "P0", task="pushing", n=1, backend="fake")
+        evaluate("zoo:picking", "P0", task="pushing", n=1, backend="fake", env=SHORT)
 
 
 @pytest.mark.parametrize(

@@ -40,6 +40,7 @@ def test_commands_say_where_they_run(command: str) -> None:
     assert "the work is done in this process\n" in done.output
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_failed_learners_are_printed_with_the_reason() -> None:
     """Below the tables, with the learner, the problem and how many runs it is."""
     lines = ("def broken(data, *, seed=0):", "    raise ValueError('no idea at all')", "")
@@ -73,6 +74,7 @@ def test_the_command_of_the_guide_runs_its_learner() -> None:
     assert "did you mean 'moves'" in " ".join(wrong.output.split())
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_the_header_of_a_benchmark_is_about_all_seeds() -> None:
     """Each seed draws its own graph, so the title gives the fewest and the most edges."""
     given = ("--learner=do_order", "--budget=40", "--seeds=3", "--no-baselines", "--out=out")

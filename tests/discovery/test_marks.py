@@ -140,6 +140,7 @@ def test_families_hide_what_acts_on_most() -> None:
             problem(name)
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_benchmarks_score_marks_beside_baselines(tmp_path: Path) -> None:
     """Every learner has scores of marks; a graph with marks has no distance to a directed one."""
     asked = {"budgets": [60, 80], "seeds": 2, "standardised": False}
@@ -154,6 +155,7 @@ def test_benchmarks_score_marks_beside_baselines(tmp_path: Path) -> None:
         assert run.scores["confounded"] == len(truth.confounded)
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_the_terminal_shows_scores_of_marks(tmp_path: Path) -> None:
     """Columns of marks where variables are hidden, the pairs and the sortability in the title."""
     words = ["discover", "er2:5:2", "--learner", "do_order", "--budget", "60,80", "--seeds", "1"]

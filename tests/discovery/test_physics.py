@@ -108,6 +108,7 @@ def test_no_baseline_solves_a_family(name: str, rows: int) -> None:
     assert means["do_order"] > 0.7
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_they_are_problems_of_benchmarks() -> None:
     """On raw and standardised rows, and with the simulator."""
     result = benchmark(["do_order", "paired"], ["servo:5"], budgets=[60, 70], seeds=2)

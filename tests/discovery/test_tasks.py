@@ -52,11 +52,8 @@ def first(value: Any, *_: Any) -> Any:
     return value
 
 
-KINDS = ("reaching", "pick_and_place", "stacking2", "general")
-"""The others are scenes of the same bodies: Bullet sees one of each kind.
-
-``test_discovery`` has pushing on both engines.
-"""
+KINDS = ("reaching", "pushing", "pick_and_place", "stacking2", "general")
+"""The others are scenes of the same bodies: Bullet sees one of each kind."""
 RUNS = [
     (task, backend) for backend in ENGINES for task in TASKS if backend == "mujoco" or task in KINDS
 ]

@@ -117,6 +117,7 @@ def test_they_work_on_any_table(name: str) -> None:
         assert np.array_equal(found.edges, again.edges)
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_they_use_the_data_of_the_learners_beside_them() -> None:
     """Rows of the kind that the others use; in tables they come last."""
     asked = {"problems": ["er2:4"], "budgets": [60, 80], "seeds": 1, "standardised": False}

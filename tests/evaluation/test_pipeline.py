@@ -33,7 +33,7 @@ from scm_world.errors import (
     UnreadableFile,
     UnwritableFolder,
 )
-from scm_world.evaluation import evaluate
+from scm_world.evaluation import Evaluation, evaluate
 from scm_world.runs import files
 
 # --- the same bits --------------------------------------------------------------------------------
@@ -44,10 +44,9 @@ def test_workers_and_order_change_nothing(tmp_path: Path) -> None:
     how: Any = {"n": 27, "backend": "mujoco", "env": {"max_episode_length": 4}}
     policies = {"one": linear, "other": opposite}
     alone = evaluate(policies, "P0,P9", **how)
-    shared = evaluate(policies, "P0,P9", workers=2, out=tmp_path, **how)
-    assert shared == alone
     assert len(alone) == 2 * 2 * 27
-    turned = evaluate({"other": opposite, "one": linear}, "P9,P0", **how)
+    turned = evaluate(dict(reversed(policies.items())), "P9,P0", workers=2, out=tmp_path, **how)
+    assert len(turned) == len(alone)
     for agent in policies:
         for protocol in ("P0", "P9"):
             mine, its = (e.only(agent=agent, protocol=protocol).frame for e in (alone, turned))
@@ -95,21 +94,30 @@ import sys, time
 sys.path.insert(0, {tests!r})
 from pathlib import Path
 from evaluation_samples import linear
-from scm_world.evaluation import evaluate
+from scm_world.evaluation import Evaluation, evaluate
 def told(done, planned):
     time.sleep(0.2)  # so that there is time to interrupt it
-evaluate({{"mine": linear}}, "P0,P6", n=150, backend="fake", env={{"max_episode_length": 3}},
+evaluate({{"mine": linear}}, "P0,P6", n=100, backend="fake", env={{"max_episode_length": 3}},
          workers={workers}, out={out!r}, progress=told)
 """
+HOW: dict[str, Any] = {"n": 100, "backend": "fake", "env": {"max_episode_length": 3}}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Evaluation, dict[str, bytes]]:
+    """Give the rows and files of one that nothing interrupts: eight parts."""
+    out = tmp_path_factory.mktemp("whole")
+    return evaluate({"mine": linear}, "P0,P6", out=out, **HOW), contents(out)
 
 
 @pytest.mark.parametrize(("sent", "workers"), [(signal.SIGKILL, 2), (signal.SIGINT, 1)])
 def test_interrupted_and_resumed_is_uninterrupted(
-    sent: signal.Signals, workers: int, tmp_path: Path
+    sent: signal.Signals,
+    workers: int,
+    whole: tuple[Evaluation, dict[str, bytes]],
+    tmp_path: Path,
 ) -> None:
     """Whenever it is stopped, the same call goes on and gives the same rows and files."""
-    how: Any = {"n": 150, "backend": "fake", "env": {"max_episode_length": 3}}
-    whole = evaluate({"mine": linear}, "P0,P6", out=tmp_path / "whole", **how)
     out = tmp_path / "parts"
     text = PROGRAM.format(tests=str(Path(__file__).parent), out=str(out), workers=workers)
     process = subprocess.Popen([sys.executable, "-c", text], stderr=subprocess.PIPE)  # noqa: S603 # ours
@@ -119,11 +127,10 @@ def test_interrupted_and_resumed_is_uninterrupted(
     process.send_signal(sent)
     process.communicate()
     assert process.returncode == -sent
-    assert 2 <= len([*out.glob("parts/*.json")]) < 12
-    again = evaluate({"mine": linear}, "P0,P6", out=out, **how)
-    assert again == whole
+    assert 2 <= len([*out.glob("parts/*.json")]) < 8
+    again = evaluate({"mine": linear}, "P0,P6", out=out, **HOW)
     kept = {name: data for name, data in contents(out).items() if not name.endswith(".part")}
-    assert kept == contents(tmp_path / "whole")
+    assert (again, kept) == whole
 
 
 def test_what_is_there_is_used_again(tmp_path: Path) -> None:
@@ -224,12 +231,12 @@ def test_two_do_not_write_to_one_folder(tmp_path: Path) -> None:
 # --- policies that go wrong -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("how", "workers"), [("nan", 1), ("shape", 1), ("shape", 2)])
-def test_bad_actions_are_told_with_their_place(how: str, workers: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize("how", ["nan", "shape"])
+def test_bad_actions_are_told_with_their_place(how: str, tmp_path: Path) -> None:
     """Agent, engine, protocol, seed, episode and control step; what was finished is kept."""
     bad = {"good": linear, "bad": Waning(how, 4)}
     with pytest.raises(EvaluationError, match="gave") as caught:
-        small(bad, "P0", n=4, seeds=3, workers=workers, out=tmp_path)
+        small(bad, "P0", n=4, seeds=3, out=tmp_path)
     assert caught.value.place == {
         "agent": "bad",
         "run": 0,
@@ -239,7 +246,7 @@ def test_bad_actions_are_told_with_their_place(how: str, workers: int, tmp_path:
         "episode": 3,
         "control step": 12,
     }
-    assert len([*tmp_path.glob("parts/*.json")]) in ((1,) if workers == 1 else (0, 1))
+    assert len([*tmp_path.glob("parts/*.json")]) == 1
 
 
 @pytest.mark.parametrize("workers", [1, 2])

@@ -133,7 +133,7 @@ def test_protocols_move_what_is_published(task: str, name: str, conventions: str
     model = runner(task, conventions).world.model
     follow = {name for one in wanted for name in model.descendants(model.target(one))}
     moved: set[str] = set()
-    for done, before, now in begun(task, protocol, conventions, 6):
+    for done, before, now in begun(task, protocol, conventions, 3):
         assert done == wanted
         moved |= {n for n in now if not np.array_equal(before[n], now[n])}
     assert wanted <= moved
@@ -326,7 +326,7 @@ def test_d22_protocols_leave_no_trace(task: str) -> None:
             for episode in range(2)
         }
 
-    assert run(names) == run(reversed(names)) == run((names[1], names[3], names[0], names[2]))
+    assert run(names) == run((names[1], names[3], names[0], names[2]))
 
 
 SMALL = {"stacked_blocks": {"num_of_levels": 2}, "creative_stacked_blocks": {"num_of_levels": 3}}

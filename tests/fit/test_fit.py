@@ -128,13 +128,13 @@ def test_what_cannot_be_told_apart_is_named_and_an_experiment_determines_it(
     world: sw.World, damped: pd.DataFrame
 ) -> None:
     """Torque, mass, inertia and damping in one proportion move in the same way."""
-    names = ["hinge.damping", "pole.mass", "pole.inertia", "motor.gear"]
-    fit = world.fit(damped, names)
+    names, short = ["hinge.damping", "pole.mass", "pole.inertia", "motor.gear"], damped.iloc[:61]
+    fit = world.fit(short, names)
     assert not fit.identifiable.determined.iloc[-1]
     assert {"pole.mass", "motor.gear"} <= {*fit.confounded[-1]}
     assert "cannot be told apart" in str(fit)
     limits = {"hinge.position": (-2.5, 2.5), "motor.control": (-0.5, 0.5)}
-    (experiment,) = world.fit(damped, names[1:3]).suggest(steps=60, limits=limits)
+    (experiment,) = world.fit(short, names[1:3]).suggest(steps=60, limits=limits)
     assert experiment.after > experiment.before
     assert np.abs(experiment.commands).max() <= 0.5
     assert experiment.frame().shape == (60, 2)
@@ -543,10 +543,10 @@ def test_readouts_are_measurements(world: sw.World) -> None:
         (lambda d: d.assign(**{"hinge.position": "low"}), ModelError, "not numbers"),
         (lambda d: [d, d.assign(knee=0.0)], ModelError, "run 2: rename .* 'knee'"),
         (lambda d: {"time": d.time, "hinge.position": [0.0]}, ModelError, "a row for each instant"),
-        (lambda d: 5, UnknownOption, ".csv, .parquet or .npz"),
+        (lambda d: 5, UnknownOption, ".csv, .txt, .tsv, .parquet or .npz"),
         (lambda d: [], UnknownOption, "one or more runs"),
         (lambda d: "missing.csv", UnreadableFile, "there is no such file; give the path"),
-        (lambda d: "run.txt", UnknownOption, ".csv, .parquet, .npz"),
+        (lambda d: "run.mat", UnknownOption, ".csv, .txt, .tsv, .parquet, .npz"),
     ],
 )
 def test_wrong_recordings_are_refused(
@@ -649,12 +649,15 @@ def test_the_command(damped: pd.DataFrame, tmp_path: Path, monkeypatch: Any) -> 
     """It prints the table, and writes results with versions and seed."""
     monkeypatch.chdir(tmp_path)
     Path("pendulum.xml").write_text(PENDULUM)
-    damped.to_csv("run.csv", index=False)
+    spoiled = damped.rename(columns={"motor.control": "torque"}).assign(temperature=20.0)
+    spoiled.to_csv("run.csv", index=False, sep=";", decimal=",")
+    damped = spoiled
     damped.iloc[20:61].to_parquet("more.parquet")
     words = ["fit", "pendulum.xml", "run.csv", "more.parquet", "--out", "out"]
     more = ["--parameters", "*.damping", "--noise", "hinge.position=0.001"]
     asked = ["--suggest", "1", "--steps", "40", "--limits", "hinge.position=-2,2"]
     asked += ["--do", "pole.mass=0.3", "--at", "10", "--run", "1", "--predict", "run.csv"]
+    more += ["--column", "torque=motor.control", "--ignore", "temp*"]
     asked += ["--begins", "hinge.velocity=0,1", "--held-out", "0.3"]
     done = CliRunner().invoke(app, [*words, *more, *asked], catch_exceptions=False)
     assert done.exit_code == 0, done.output
@@ -682,12 +685,12 @@ def test_the_command(damped: pd.DataFrame, tmp_path: Path, monkeypatch: Any) -> 
     assert done.exit_code == 2
     assert Path("never/result.json").exists()  # the fit is written nevertheless
     assert "most of them those of hinge.velocity (5 to 6)" in " ".join(done.output.split())
-    short = ["fit", "pendulum.xml", "short.csv", "--out", "why", "--window", "30"]
+    short = ["fit", "pendulum.xml", "short.csv", "--out", "why", "--window", "30", *more[-4:]]
     done = CliRunner().invoke(app, short, catch_exceptions=False)
     assert done.exit_code == 0, done.output
     why = json.loads(Path("why/result.json").read_text())["explanation"]
     assert {"none", "hinge.damping", "hinge.armature", "delay"} <= {r["parameters"] for r in why}
-    done = CliRunner().invoke(app, [*words[:3], "--parameters", "knee.*"])
+    done = CliRunner().invoke(app, [*words[:3], *more[-4:], "--parameters", "knee.*"])
     assert done.exit_code == 2
     assert "no variable fits the pattern 'knee.*'" in done.output
 

@@ -33,10 +33,3 @@ def test_the_causal_column_imports_no_physics(module: str) -> None:
     loaded, printed = imported(module)
     assert not loaded & HEAVY
     assert printed == ""
-
-
-def test_the_package_is_silent_and_loads_no_engine() -> None:
-    """Importing it prints nothing, warns of nothing, and starts no engine."""
-    loaded, printed = imported("scm_world")
-    assert not loaded & (ENGINES | {"matplotlib", "scipy"})
-    assert printed == ""

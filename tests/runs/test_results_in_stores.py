@@ -103,6 +103,7 @@ def test_a_saved_dataset_is_the_same_in_a_store(tmp_path: Path) -> None:
         save(table.first(3), str(folder))
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_a_benchmark_resumes_from_a_store() -> None:
     """Run once, it is only read the second time; tables, pictures and report are there."""
     asked: Any = {"budgets": [40, 80], "seeds": 1, "standardised": False}

@@ -19,7 +19,6 @@ class TestWarp(BackendConformance):
 
     preset = FAST
     substeps = RobotConformance.substeps
-    coupling = 2e-4  # one solve for all trees of a world: 1.4e-4 by the size of a block that falls
     busy, commands = RobotConformance.busy, RobotConformance.commands
     other_value = RobotConformance.other_value
     changed_states = RobotConformance.changed_states

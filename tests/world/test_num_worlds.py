@@ -18,6 +18,9 @@ from scm_world.variables import Action, Box, Exogenous, Hard, Measured, Normal, 
 from scm_world.world import Batch
 
 N = 3
+HINGE = """<mujoco><worldbody><body><joint name="hinge" axis="0 0 1"/><geom size=".1" mass="1"/>
+</body></worldbody>
+<actuator><motor name="motor" joint="hinge" ctrlrange="-1 1"/></actuator></mujoco>"""
 
 
 class Growth(StepTask):
@@ -163,3 +166,19 @@ def test_the_layers_of_a_plan_hold_in_every_world(source: str) -> None:
     alone.reset(seed=4, do=plan)
     assert worlds[name].tolist() == [value + 0.01] * 2
     assert worlds[name][1] == alone[name]
+
+
+def test_a_held_action_ends_with_the_episode() -> None:
+    """Worlds that acted alone, since an action was held, take their actions after a reset."""
+    worlds, alone = World(HINGE, num_worlds=N), World(HINGE)
+    for world in (worlds, alone):
+        world.reset(seed=0)
+        world.do({"motor.control": 0.9})
+    worlds.step(np.zeros((N, 1)))
+    alone.step(np.zeros(1))
+    assert worlds["hinge.position"][0] == alone["hinge.position"] > 0.0
+    for world in (worlds, alone):
+        world.reset(seed=0)
+    worlds.step(np.full((N, 1), -0.25))
+    alone.step(np.full(1, -0.25))
+    assert worlds["hinge.position"][0] == alone["hinge.position"] < 0.0

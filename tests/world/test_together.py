@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from worlds import NEEDS_BULLET
 
+from benchmarks.fuzz import random_request
 from scm_world import World
 from scm_world.errors import (
     EngineFailure,
@@ -28,6 +29,7 @@ from scm_world.variables import (
     Function,
     Hard,
     Measured,
+    Mechanism,
     Natural,
     Normal,
     Scale,
@@ -41,6 +43,11 @@ N = 6
 def drag(mass: float, noise: float = 0.0) -> float:
     """Compute a parameter that follows another one."""
     return 0.5 * mass + noise
+
+
+def raised(size: Any) -> Any:
+    """Compute where a block stands on the floor."""
+    return np.array([0.12, 0.03, 0.5 * size[2]])
 
 
 class Cart(StepTask):
@@ -101,7 +108,7 @@ def same(worlds: Batch, alone: list[World]) -> None:
         if world.base is not None:
             assert one.base.pending == world.base.pending
             assert one.base.drawn == world.base.drawn
-            kept = world.compiled.kept  # the columns that are not computed from others
+            kept = world.base.row.compiled.kept  # the columns that are not computed from others
             found, wanted = (each.base.row.numbers[kept] for each in (one, world))
             np.testing.assert_array_equal(found, wanted)
         assert one.requested.keys() == world.requested.keys()
@@ -193,6 +200,82 @@ def test_histories_are_those_of_single_worlds(kind: str, seed: int) -> None:
         worlds.step(np.zeros((N, alone[0].action_low.size)))
         for world in alone:
             world.step(np.zeros(world.action_low.size))
+    same(worlds, alone)
+
+
+BLOCK = "tool_block.cartesian_position"
+MOVES: list[dict[str, Any]] = [
+    {BLOCK: Draw("A")},
+    {"tool_block.cylindrical_position": Draw("A"), "tool_block.mass": 0.05},
+    {BLOCK: Shift((0.001, 0.0, 0.0))},
+    {"tool_block.linear_velocity": np.linspace(0.0, 0.1, 3 * N).reshape(N, 3)},
+    {BLOCK: np.array([[0.1 * np.cos(i), 0.1 * np.sin(i), 0.0325] for i in range(N)])},
+    {"tool_block.size": [0.06, 0.05, 0.07]},
+    {"tool_block.size": Draw("A"), BLOCK: Mechanism(raised, ("tool_block.size",))},
+    {"tool_block.orientation": [0.0, 0.0, 0.6, 0.8]},
+    {"tool_block.mass": Mechanism(drag, ("floor_friction",)), "floor_friction": Draw(0.2, 0.4)},
+    {"floor_friction": Scale(1.1)},
+    {"joint_positions": Draw("A")},
+    {"tool_block.linear_velocity": Natural(), "tool_block.mass": Natural()},
+    {"control_index": 7},
+    {"action": np.full(9, 0.1)},
+]
+
+
+@pytest.mark.parametrize("backend", ["fake", "mujoco", pytest.param("bullet", marks=NEEDS_BULLET)])
+@pytest.mark.parametrize("seed", range(3))
+def test_histories_of_any_kind_are_those_of_single_worlds(backend: str, seed: int) -> None:
+    """What moves bodies, mechanisms, draws again and refusals, at one instant or several."""
+    worlds: Any = World("pushing", backend=backend, num_worlds=N)
+    alone: list[Any] = [World("pushing", backend=backend) for _ in range(N)]
+    rng = np.random.default_rng(seed)
+    together = moved = refused = 0
+    for turn in range(40):
+        if turn % 10 == 0:
+            worlds.reset(seed=seed + turn)
+            for row, world in enumerate(alone):
+                world.reset(seed=seed + turn + row)
+        mask = rng.random(N) < 0.7
+        mask[rng.integers(N)] = True
+        if turn % 10 and rng.random() < 0.3:
+            action = rng.uniform(-1.0, 1.0, (N, 9))
+            worlds.step(action, where=mask)
+            for row in np.flatnonzero(mask):
+                alone[row].step(action[row])
+            continue
+        request = MOVES[rng.integers(len(MOVES)) if turn % 10 else turn // 10]
+        if turn % 10 and rng.random() < 0.3:
+            request = random_request(alone[int(np.argmax(mask))], rng)
+        audits = worlds.do(request, where=mask, on_refusal="skip")
+        done = [worlds._done[row] for row in np.flatnonzero(mask)]
+        together += any(one is not None and one.asked for one in done)
+        moved += any(one is not None and one.states is not None for one in done)
+        for row in np.flatnonzero(mask).tolist():
+            own = {
+                n: v[row] if isinstance(v, np.ndarray) and v.ndim == 2 else v
+                for n, v in request.items()
+            }
+            try:
+                audit, problem = alone[row].do(own), ""
+            except InterventionError as error:
+                audit, problem = None, str(error)
+            refused += bool(problem)
+            assert str(audits.refused.get(row, "")) == problem
+            if problem:
+                continue
+            assert row in audits
+            if rng.random() < 0.2:  # an audit can be read at any time
+                assert str(audits[row]) == str(audit)
+        if rng.random() < 0.3:
+            values_are_same(worlds, alone)
+    assert together > 0
+    assert moved > 0
+    assert refused > 0
+    same(worlds, alone)
+    for _ in range(2):
+        worlds.step(np.zeros((N, 9)))
+        for world in alone:
+            world.step(np.zeros(9))
     same(worlds, alone)
 
 

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import copy
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from abc import abstractmethod
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import cache
-from typing import Any, ClassVar, final
+from typing import Any, Literal, final
 
 import mujoco
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from scm_world._types import Floats, Mask
+from scm_world.backends.checkable import Checkable, commands
 from scm_world.errors import UnknownOption
 
 RESOLUTION = 1e-9
@@ -47,19 +48,16 @@ FREE = {
 """Units of positions and velocities of joints, by their kind: free, ball, slide, hinge."""
 
 
-class MujocoModels(ABC):
+class MujocoModels(Checkable):
     """Several MuJoCo models, each with a state.
 
     A range has the name of a field, ``"body_mass"``, of an element, ``"body_mass[torso]"``, or of a
     column, ``"geom_friction[floor, 0]"`` and ``"geom_friction[:, 0]"``; ``"opt.gravity"``, too.
     """
 
-    num_envs: int
-    n_actions: int
-    draws: ClassVar[bool] = True  # whether a reset draws values
-    by: ClassVar[str] = "reset"
+    by: Literal["set", "reset"] = "reset"
+    given = True  # whether somebody declared ranges
     compiled: mujoco.MjModel  # the model, as its file has it
-    follows = False  # whether derived constants follow a value that is set
 
     @property
     @abstractmethod
@@ -89,8 +87,11 @@ class MujocoModels(ABC):
         """Return the values of the file, for all worlds."""
         return np.repeat(np.array(_read(self.compiled, name))[None], self.num_envs, axis=0)
 
-    def usual(self) -> dict[str, tuple[Floats, Floats]]:
-        """Return ranges around the values of the file."""
+    def declared(self, ranges: Mapping[str, Any] | None) -> Mapping[str, Any]:
+        """Return declared ranges, or those around the usual values of the file."""
+        self.given = ranges is not None
+        if ranges is not None:
+            return ranges
         found = {name: np.array(_read(self.compiled, name)) for name in USUAL}
         found["opt.gravity"] = self.compiled.opt.gravity.copy()
         ends = {name: [end * value for end in SPREAD] for name, value in found.items()}
@@ -98,11 +99,15 @@ class MujocoModels(ABC):
             name: (np.minimum(a, b), np.maximum(a, b)) for name, (a, b) in ends.items() if a.any()
         }
 
-    def untouched(self, name: str) -> str:
+    def idle(self, name: str, *, ran: bool) -> str:
         """Return why no response was seen of what acts in contacts alone, or nothing."""
+        if not ran:
+            return ""
         touching = any(self.contacts(world) for world in range(self.num_envs))
         by_contact = name.startswith(BY_CONTACT) and not touching
-        return "it acts in contacts, and nothing touches" if by_contact else ""
+        if by_contact:
+            return "it acts in contacts, and nothing touches"
+        return "" if self.given else "no number of the state differs, and nobody declared it"
 
     def unit(self, name: str) -> str:
         """Return the unit of a field."""
@@ -123,11 +128,6 @@ class MujocoModels(ABC):
         """Return positions and velocities, shape (n, nq + nv)."""
         return np.array([np.concatenate(self.state(world)) for world in range(self.num_envs)])
 
-    def commands(self, actions: Floats, low: Floats, high: Floats) -> Floats:
-        """Return commands of actions in [-1, 1], shape (n, n_actions)."""
-        low, high = np.maximum(low, -1e3), np.minimum(high, 1e3)
-        return np.asarray(low + (actions + 1.0) / 2.0 * (high - low))
-
     # --- derived constants ------------------------------------------------------------------------
 
     def stale(self, name: str) -> dict[str, float]:
@@ -147,13 +147,14 @@ class MujocoModels(ABC):
 
     def refresh(self) -> Callable[[], None]:
         """Compute derived constants anew in all models; return what writes the old ones back."""
-        back = self.keep()
+        back = self.keep(())
         for model in self.models:
             _derive(model)
         return back
 
-    def keep(self) -> Callable[[], None]:
+    def keep(self, names: Collection[str]) -> Callable[[], None]:
         """Return what writes all numbers of the present models again, whatever a reset draws."""
+        del names
         kept = [{name: _read(model, name) for name in _fields()} for model in self.models]
 
         def back() -> None:
@@ -188,7 +189,7 @@ class GymnasiumModels(MujocoModels):
 
     def __init__(self, envs: Any, *, given: bool) -> None:
         self.envs, self.num_envs = envs, envs.num_envs
-        self.by = "reset" if given else "set"  # type: ignore[misc] # of this one
+        self.by = "reset" if given else "set"
         self.members = [env.unwrapped for env in envs.unwrapped.envs]
         self.actions = envs.single_action_space
         self.n_actions = int(np.prod(self.actions.shape))
@@ -222,8 +223,8 @@ class GymnasiumModels(MujocoModels):
         """Advance all environments; return which of them ended an episode."""
         shape = (self.num_envs, *self.actions.shape)
         ends = (np.ravel(self.actions.low), np.ravel(self.actions.high))
-        commands = self.commands(actions, *ends).reshape(shape).astype(self.actions.dtype)
-        _, _, terminated, truncated, _ = self.envs.step(commands)
+        sent = commands(actions, *ends).reshape(shape).astype(self.actions.dtype)
+        _, _, terminated, truncated, _ = self.envs.step(sent)
         ended: Mask = terminated | truncated
         if ended.any() and self.envs.metadata["autoreset_mode"] is AutoresetMode.DISABLED:
             self.reset(0, ended)
@@ -301,7 +302,7 @@ class RolloutModels(MujocoModels):
         model = self.compiled
         limited = model.actuator_ctrllimited.astype(bool)
         ends = [np.where(limited, model.actuator_ctrlrange[:, i], (-1.0, 1.0)[i]) for i in (0, 1)]
-        control = self.commands(actions, *ends)[:, None, :]
+        control = commands(actions, *ends)[:, None, :]
         found, _ = rollout.rollout(self._models, self.data, self.states, control)
         self.states = found[:, -1].copy()
 

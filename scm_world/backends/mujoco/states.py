@@ -23,7 +23,7 @@ MOTION = sum(int(getattr(mujoco.mjtState, f"mjSTATE_{part}")) for part in ("QPOS
 
 
 @njit(cache=True, error_model="numpy")
-def _rotate(turn: Floats, vector: Floats, sign: float) -> None:
+def rotate(turn: Floats, vector: Floats, sign: float) -> None:
     """Rotate a vector in place by a quaternion (x, y, z, w); back by it if the sign is -1."""
     x, y, z, w = turn[0], turn[1], turn[2], turn[3]
     scale = 2.0 / (w * w + x * x + y * y + z * z)
@@ -61,7 +61,7 @@ def read_rows(
             state[table[i + 1]] = forces[row, table[i]]
         for body in range(table[2]):
             q, v = table[reported + 2 * body], table[reported + 2 * body + 1]
-            _rotate(state[q : q + 4], state[v : v + 3], 1.0)
+            rotate(state[q : q + 4], state[v : v + 3], 1.0)
             if state[q + 3] < 0.0:
                 for i in range(q, q + 4):
                     state[i] = -state[i]
@@ -131,7 +131,7 @@ def into_bodies(
         sign = -1.0 if turn[3] < 0.0 else 1.0
         for i in range(4):  # w comes first
             motion[own[body, i]] = sign * turn[(i + 3) % 4] if turns else exact[body, i]
-        _rotate(turn, spin, -1.0)
+        rotate(turn, spin, -1.0)
         for i in range(3):
             motion[own[body, 4 + i]] = spin[i] if spins else exact[body, 4 + i]
 

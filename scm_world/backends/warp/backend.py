@@ -7,13 +7,15 @@ from typing import Any, ClassVar, final
 import mujoco_warp as mjw
 import numpy as np
 
+from scm_world._types import Floats
 from scm_world.backends.base import Capabilities, OneScene, Scenes
 from scm_world.backends.warp.device import resolve
-from scm_world.backends.warp.scenes import WarpScenes
-from scm_world.models.scene import Parameters
+from scm_world.backends.warp.scenes import WarpScenes, prepared
+from scm_world.models.model import Model
+from scm_world.models.scene import Parameters, Structure
 
-ROUNDING = 1e-4
-"""Largest change of a state in a control step that is no effect, by its value or one unit."""
+EPSILON = float(np.finfo(np.float32).eps)
+LOST = 10.0  # last places of a number that a control step may lose
 
 
 @final
@@ -49,13 +51,21 @@ class WarpBackend(OneScene):
         Before there is a scene, that is the precision of a number.
         """
         scenes = None if self.device == "cpu" else 16_384
-        return Capabilities(floor=self._floor(), rounding=ROUNDING, scenes=scenes, remarks=_remarks)
+        return Capabilities(
+            floor=self._floor(), rounding=_rounding, scenes=scenes, remarks=_remarks
+        )
 
     def _floor(self) -> float:
         if self.device == "cpu":
             return 0.0
         scenes: Any = self.scenes
-        return scenes.floor(self.which[0]) if self._is_built else float(np.finfo(np.float32).eps)
+        return scenes.floor(self.which[0]) if self._is_built else EPSILON
+
+
+def _rounding(backend: WarpBackend, structure: Structure, substeps: int) -> Floats:
+    model = Model.of(structure, "mujoco-warp")
+    base, _ = prepared(model, backend.device)
+    return np.maximum(base.coupling(model, substeps), LOST * EPSILON)
 
 
 def _remarks(backend: WarpBackend, before: Parameters) -> tuple[str, ...]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, ClassVar, Self, final
 
@@ -36,9 +37,13 @@ from scm_world.models.scene import (
 _NOBODY: tuple[Any, ...] = ((), np.empty((0, 7)), np.empty((0, 7)))
 
 
+def prepared(structure: Model, device: str) -> tuple[SharedModel, Derivation]:
+    """Put a structure on a device, once for each thread: constants are derived in one model."""
+    return _prepared(structure, device, threading.get_ident())
+
+
 @lru_cache(maxsize=32)
 def _prepared(structure: Model, device: str, thread: int) -> tuple[SharedModel, Derivation]:
-    """Put a structure on a device, once for each thread: constants are derived in one model."""
     base = SharedModel(compiled(structure), device)
     return base, Derivation(structure, base.model)
 
@@ -59,7 +64,7 @@ class Group:
 
     def __init__(self, structure: Model, device: str) -> None:
         self.structure = structure
-        self._base, self.derive = _prepared(structure, device, threading.get_ident())
+        self._base, self.derive = prepared(structure, device)
         self._engine: Engine | None = None
         mj = self._base.mj
         data, width = mujoco.MjData(mj), 0
@@ -179,7 +184,7 @@ class Group:
 
             yield places, derived
 
-    def _synced(self) -> Engine:
+    def synced(self) -> Engine:
         """Return the engine, with the parameters of all scenes on the device."""
         engine = self._engine
         if engine is None:
@@ -212,7 +217,7 @@ class Group:
         derived = [k for k in wanted if k[1] == "inertia" and k[0] in bodies]
         own = [key for key in wanted if key in self.structure.rows]
         self.derive.scene.check([key for key in wanted if key not in {*own, *derived}])
-        engine = self._synced()
+        engine = self.synced()
         wrong = [name for name, rows in self._fields.items() if engine.differs(name, slots, rows)]
         if wrong:
             said = f"the device does not have the numbers of {', '.join(wrong)} that it was given"
@@ -304,10 +309,29 @@ class Group:
         if (np.diff(slots) != 1).any():
             raise EngineFailure("the worlds have different structures; read world[name]", "warp")
         self._is_watched = True
-        engine = self._synced()
+        engine = self.synced()
         self._show(engine, np.arange(len(self.rows)))
         array = engine.state[row.array].array[int(slots[0]) : int(slots[-1]) + 1, first:last]
         return array.numpy() if array.device.is_cpu else array
+
+    def resident(self, slots: Integers, copies: Counter[str]) -> Any:
+        """Let the states of scenes that follow one another, and are all there are, stay there."""
+        from scm_world.backends.warp.resident import Resident  # needs torch
+
+        if (np.diff(slots) != 1).any():
+            raise EngineFailure("the worlds do not follow one another", "warp")
+        return Resident(self, slots, self._places, self._turned, copies)
+
+    def numbers(self, slots: Integers) -> dict[str, NDArray[np.float32]]:
+        """Return what a step continues from in some scenes, by name, shape (m, k) each."""
+        return {name: self.rows[slots, where] for name, where in self._slices.items()}
+
+    def adopt_step(self, slots: Integers, numbers: Mapping[str, NDArray[np.float32]]) -> None:
+        """Take over what a step has left in some scenes, without its contacts."""
+        for name, where in self._slices.items():
+            self.rows[slots, where] = numbers[name]
+        self._written[slots], self._live[slots] = np.nan, False
+        self._last[slots] = self._touch[slots] = None
 
     def _show(self, engine: Engine, slots: Integers) -> None:
         """Write the states of some scenes to the device."""
@@ -332,7 +356,7 @@ class Group:
         self, slots: Integers, commands: Floats, substeps: int
     ) -> tuple[Floats, dict[int, str]]:
         """Step some scenes; return their states, and why some are lost, by place."""
-        engine, reasons = self._synced(), dict[int, str]()
+        engine, reasons = self.synced(), dict[int, str]()
         staying = np.ones(len(self.rows), dtype=bool)
         staying[slots] = False
         self._keep_touches(~staying)
@@ -460,6 +484,7 @@ class WarpScenes(Scenes):
     """
 
     may_refuse: ClassVar[bool] = False
+    stays: ClassVar[bool] = True
     version = mjw.__version__
 
     def __init__(self, n: int, threads: int = 1, device: str = "cpu") -> None:
@@ -640,6 +665,13 @@ class WarpScenes(Scenes):
         if len(groups) > 1:
             raise EngineFailure("the worlds have different structures; read world[name]", self.name)
         return groups[0][0].tensor(groups[0][2], name)
+
+    def resident(self, which: Integers, copies: Counter[str]) -> Any:
+        """Let the states of scenes stay on the device from step to step; see ``Resident``."""
+        groups = self._grouped(which)
+        if len(groups) > 1:
+            raise EngineFailure("the worlds have different structures", self.name)
+        return groups[0][0].resident(groups[0][2], copies)
 
     def remarks(self, index: int, before: Parameters) -> tuple[str, ...]:
         """List which of some changed parameters of a scene have no effect, and why."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, replace
+from itertools import repeat
 from typing import Any, final
 
 import numpy as np
@@ -36,10 +37,12 @@ from scm_world.queries.identification import in_force
 from scm_world.queries.local import contact_terms
 from scm_world.queries.plans import Plan
 from scm_world.queries.samples import Outcome, Setting, named_outcomes
+from scm_world.queries.together import Episodes
 from scm_world.queries.twins import asked
-from scm_world.variables import Noise, Normal
+from scm_world.variables import Normal
 from scm_world.variables.reserved import SENSOR_NOISE
 from scm_world.world import CausalSystem, Simulation
+from scm_world.world.philox import NoiseOfRows
 
 STREAM = "sensor of"
 """Begins the names of the streams; draws of ``sensor_noise`` itself have another one."""
@@ -228,12 +231,16 @@ class EpisodeRows:
         refused: dict[str, str] = {}
         touching: dict[str, Any] = {}
 
-        def finish(episode: Episode) -> Any:
-            touched = [[list(pair) for pair in sorted(step)] for step in episode.touched]
-            return self._values(episode), self._look(episode), touched
+        def finish(ran: Episodes) -> Iterator[Any]:
+            looks = map(self._look, ran) if self._pictures else repeat([])
+            both = map(_touched, ran) if self._contacts else repeat(None)
+            return zip(self._values(ran), looks, both, strict=False)
 
         written = {*self._watched} - {*world.compiled.slices, *world.static_names}
         names = tuple(name for name in self._watched if name in written)
+        whole = self._every_step or not {o.how for o in self._read} <= {"final", "first", "change"}
+        ends = not (self._pure or whole) and world.compiled.decided.isdisjoint(names)
+        how: Any = {"ends": ends, "listens": self._contacts}
         cases = [*self._design.cases(seed, numbers)]
         kinds: dict[int, tuple[Unit, list[Regime]]] = {}
         for *_, regime in cases:
@@ -241,7 +248,7 @@ class EpisodeRows:
                 unit = self._unit(regime, 0, names)
                 rows = [replace(regime, targets=self._targets(regime.targets, t)) for t in (0, 1)]
                 steps = unit.steps + self._further
-                kinds[id(regime)] = replace(unit, steps=steps, listens=self._contacts), rows
+                kinds[id(regime)] = replace(unit, **how, steps=steps), rows
         units = [replace(kinds[id(regime)][0], number=number) for _, number, regime in cases]
         found = self._twins.run(units, finish, self._setting.workers, InterventionError)
         for (number, _, regime), result in zip(cases, found, strict=True):
@@ -272,35 +279,50 @@ class EpisodeRows:
         there = reached(model, names, self.columns, first=whole)
         return tuple(n for n in there if whole or step == 0 or not is_state(model, n))
 
-    def _values(self, episode: Episode) -> Floats:
-        """Return the rows of an episode, shape (rows, p)."""
-        last, compiled = episode.steps, self._world.compiled
+    def _values(self, episodes: Episodes) -> Floats:
+        """Return the rows of each episode, shape (n, rows, p)."""
+        n, last = len(episodes), episodes.steps
         if self._pure and self._every_step:  # the first step reads the first instant
-            return np.array(episode.vectors[min(last, 1) : last + 1 - self._further])
+            return episodes.vectors[:, min(last, 1) : last + 1 - self._further]
         if self._every_step:
-            parts = [self._sensed(episode, name, range(last))[:-1] for name in self._watched]
-            return np.concatenate([part.reshape(last, -1) for part in parts], axis=1)
+            parts = [self._sensed(episodes, name, range(last))[:, :-1] for name in self._watched]
+            return np.concatenate([part.reshape(n, last, -1) for part in parts], axis=2)
         ends = {"final": (last,), "first": (0,), "change": (0, last)}
-        values = []
+        values, decided = [], self._world.compiled.decided
         for outcome in self._read:
             steps = ends.get(outcome.how, range(1, last + 1))
-            seen, decided = self._sensed(episode, outcome.name, steps), compiled.decided
-            values.append(outcome._of_many(seen[None], outcome.name in decided)[0])
-            if not np.isfinite(values[-1]).all():
-                raise UnknownOption(f"value of {outcome}", values[-1], ("finite numbers",))
-        return np.concatenate([np.ravel(value) for value in values])[None]
+            seen = self._sensed(episodes, outcome.name, steps)
+            values.append(outcome._of_many(seen, outcome.name in decided).reshape(n, 1, -1))
+            wrong = ~np.isfinite(values[-1]).all(axis=(1, 2))
+            if wrong.any():
+                raise UnknownOption(
+                    f"value of {outcome}", values[-1][wrong][0], ("finite numbers",)
+                )
+        return np.concatenate(values, axis=2)
 
-    def _sensed(self, episode: Episode, name: str, steps: Iterable[int]) -> Floats:
+    def _sensed(self, episodes: Episodes, name: str, steps: Iterable[int]) -> Floats:
         """Return a variable at every instant, with sensor noise at some instants."""
-        values, half = np.array(episode[name], dtype=np.float64), self._half.get(name)
-        if half is None or not half.any() or not np.any(episode[SENSOR_NOISE]):
+        values, half = episodes.read(name).astype(np.float64), self._half.get(name)
+        if half is None or not half.any():
             return values
-        noise, strength = Noise(episode.seed), episode[SENSOR_NOISE]
-        stream, shape = f"{STREAM} {name}", values.shape[1:]
+        strength, shape = episodes.read(SENSOR_NOISE), values.shape[2:]
+        noisy = np.flatnonzero(strength.any(axis=1))
+        if not noisy.size:
+            return values
+        units = [episodes.units[place] for place in noisy.tolist()]
+        noise = NoiseOfRows([unit.seed for unit in units], len(units))
+        numbers = np.array([unit.number for unit in units], dtype=np.uint64)
         for step in steps:
-            drawn = noise.draw(NORMAL, stream, shape, {}, episode=episode.number, step=step)
-            values[step] += float(strength[step]) * half.reshape(shape) * drawn[0]
+            how: dict[str, Any] = {"episode": numbers, "step": step, "count": len(units)}
+            drawn = noise.draw(NORMAL, f"{STREAM} {name}", shape, {}, **how)
+            scale = strength[noisy, step].reshape(-1, *[1] * len(shape)) * half.reshape(shape)
+            instants = values.shape[1]  # two, if only the ends were recorded
+            values[noisy, step if instants > episodes.steps else min(step, 1)] += scale * drawn
         return values
+
+
+def _touched(episode: Episode) -> list[Any]:
+    return [[list(pair) for pair in sorted(step)] for step in episode.touched]
 
 
 def half_range(world: Simulation, name: str) -> Floats:
@@ -321,7 +343,7 @@ def half_range(world: Simulation, name: str) -> Floats:
 def usual_shard(system: CausalSystem | SCM) -> int:
     """Return how many episodes a file has: at least as many as an engine steps best together."""
     twins, world = asked(system)
-    return 10_000 if world.backend is None else max(100, twins.scenes or 0)
+    return 10_000 if world.backend is None else max(500, twins.scenes or 0)
 
 
 def policy_name(policy: object) -> str:

@@ -106,8 +106,7 @@ class Paired:
             self.actions, task = self.world.compiled.actions, self.world.task
             self.generated = task.generated_graph
             self.floors = {name: FACTOR * size for name, size in task.noise_floors.items()}
-            self._least, size = rounds_at(self.world), self.world.backend.capabilities.rounding
-            self._rounding = dict.fromkeys(self.states, size) if size > RESOLUTION else {}
+            self._least, self._rounding = rounds_at(self.world), coupling(self.world, self.states)
             self._terms = contact_terms(self.world) if apart or self._rounding else None
             if self._rounding:
                 by_contact = (e.key for e in self.model.edges if e.when == "contact")
@@ -377,6 +376,20 @@ def opened(system: object, options: Mapping[str, Any]) -> Iterator[Simulation | 
 
         with closing(World(system, **options)) as world, opened(world, {}) as found:
             yield found
+
+
+def coupling(world: Simulation, states: Iterable[str]) -> dict[str, float]:
+    """Return how far bodies that do not touch move states in a control step; empty if they do not.
+
+    It is by the larger of their values and one unit, the largest of the numbers of each.
+    """
+    layout, engine = world.structure.empty_state().layout, world.backend
+    given = engine.capabilities.rounding(engine, world.structure, world.substeps)
+    found = np.broadcast_to(given, (layout.size,))
+    if found.max(initial=0.0) <= RESOLUTION:
+        return {}
+    most = {name: float(found[where].max(initial=0.0)) for name, where in layout.slices.items()}
+    return {name: most[name] for name in states if name in most}
 
 
 def settable(model: SCM) -> tuple[str, ...]:

@@ -133,8 +133,7 @@ def minus_grasp_distance(tips: Floats, block: Floats, size: Floats) -> float:
         mean = 0.0
         for axis in range(3):
             gap = abs(tips[3 * finger + axis] - block[axis])
-            if gap >= size[axis]:
-                mean += gap / 3.0
+            mean += gap / 3.0 * (gap >= size[axis])
         total += mean
         farthest = max(farthest, mean)
     return farthest - total

@@ -57,6 +57,10 @@ class Sweep:
         rows = self._way if "effector" in world.options.action_mode else self._joints
         return rows[np.minimum(np.arange(first, first + count), len(rows) - 1)]
 
+    def together(self, world: Simulation, episodes: Any, first: int, count: int) -> Floats:
+        """Return the same actions for several episodes; see ``OpenLoopPolicy``."""
+        return np.repeat(self.ahead(world, first, count)[None], len(episodes), axis=0)
+
     def __call__(self, world: Simulation) -> Floats:
         """Return the action of the present step."""
         action: Floats = self.ahead(world, world.index, 1)[0]

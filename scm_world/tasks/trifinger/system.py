@@ -164,10 +164,9 @@ class TriFinger(Model, Assembly):
         """
         if not self.torques:
             state.joint_positions[:] = command
-            state.joint_torques[:] = 0.0
-        else:
-            state.joint_torques[:] = command
-        state.positions[:] += seconds * state.linear_velocities
+        state.joint_torques[:] = command if self.torques else 0.0
+        blocks = state.blocks
+        blocks[:, :3] += seconds * blocks[:, 7:10]
 
     def settle(self, state: PhysicalState) -> None:
         """Turn quaternions so that w is not negative."""

@@ -14,8 +14,6 @@ from scm_world.testing.backend import BackendConformance
 class TestWarp(BackendConformance):
     """The suite of every engine, on its own model."""
 
-    coupling = 1e-5  # one solve for all trees of a world
-
     def make(self) -> Backend:
         """Create a backend on the CPU device."""
         return WarpBackend("cpu")

@@ -93,6 +93,8 @@ class RobotCommands(Commands):
         self._by_tips = action_mode == "end_effector_positions"
         low, high = ACTIONS[action_mode][1].bounds((N_JOINTS,), {})
         self._half = (high - low) / 2.0
+        if not self._by_tips:
+            self.added = ACTUATOR_NOISE, STREAM, self._half
 
     def applies(self, values: Values) -> Any:
         """Return whether fingertips are commanded, or the actuators have noise."""

@@ -1,0 +1,95 @@
+"""Tables of text as loggers write them, and what a fit writes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import scm_world as sw
+from scm_world.errors import ModelError, UnknownOption
+from scm_world.fit.recordings import Reading, read_recording
+
+PENDULUM = """
+<mujoco model="pendulum">
+  <worldbody>
+    <body name="pole">
+      <joint name="hinge" axis="0 1 0" damping="0.01"/>
+      <geom name="rod" type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="0.2"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="motor" joint="hinge"/></actuator>
+</mujoco>
+"""
+TABLE = pd.DataFrame(
+    {
+        "time": [0.0, 0.02, 0.04],
+        "motor.control": [0.5, -0.25, 0.125],
+        "hinge.position": [0.001, 1.5e-3, -0.25],
+    }
+)
+
+
+@pytest.fixture(scope="module")
+def world() -> sw.World:
+    """A pendulum with a motor."""
+    return sw.World(PENDULUM)
+
+
+def with_commas(separator: str) -> str:
+    """Return the table with decimal commas."""
+    return TABLE.to_csv(index=False, sep=separator, decimal=",")
+
+
+TEXTS = {
+    "plain": TABLE.to_csv(index=False),
+    "semicolons": TABLE.to_csv(index=False, sep=";"),
+    "tabs": TABLE.to_csv(index=False, sep="\t"),
+    "spaces": TABLE.to_string(index=False),
+    "decimal commas": with_commas(";"),
+    "decimal commas and tabs": with_commas("\t"),
+    "comments": "% logger 3\n\n# begun\n"
+    + TABLE.to_csv(index=False).replace("\n0.02", "\n# x\n0.02"),
+    "a mark of the order of bytes": "\ufeff" + TABLE.to_csv(index=False),
+    "names in a comment": "# arm 2\n# " + TABLE.to_csv(index=False),
+    "empty rows": TABLE.to_csv(index=False) + ",,\n",
+}
+
+
+@pytest.mark.parametrize("text", TEXTS.values(), ids=TEXTS)
+def test_tables_of_text(world: sw.World, tmp_path: Path, text: str) -> None:
+    """The same numbers."""
+    (tmp_path / "run.csv").write_text(text)
+    (run,) = read_recording(world, tmp_path / "run.csv").runs
+    np.testing.assert_array_equal(run.commands[:, 0], TABLE["motor.control"][:2])
+    np.testing.assert_array_equal(run.values[:, 0], TABLE["hinge.position"])
+
+
+def test_columns_are_renamed_and_left_out(world: sw.World, tmp_path: Path) -> None:
+    """In files, frames and arrays by name; a column that is not there is said."""
+    other = TABLE.set_axis(["stamp", " torque", "q"], axis=1).assign(temp_1=20.0, note="a")
+    other.to_csv(tmp_path / "run.csv", index=False)
+    columns = {"stamp": "time", "torque": "motor.control", "q": "hinge.position"}
+    how = Reading(None, columns, ["temp*", "note"])
+    for given in (tmp_path / "run.csv", other, {n: other[n].to_numpy() for n in other}):
+        (run,) = read_recording(world, given, how).runs
+        np.testing.assert_array_equal(run.values[:, 0], TABLE["hinge.position"])
+    runs = read_recording(world, [other, tmp_path / "run.csv"], how).runs
+    assert len(runs) == 2
+    with pytest.raises(UnknownOption, match="no column of the table is named 'speed'"):
+        read_recording(world, other, Reading(None, {**columns, "speed": "hinge.velocity"}))
+    with pytest.raises(ModelError, match=r"columns=\{'stamp': 'time'\}"):
+        read_recording(world, other)
+
+
+def test_clocks_that_are_no_multiple_of_the_physics_step_are_told_what_to_do() -> None:
+    """The advice works."""
+    odd = TABLE.assign(time=[0.0, 0.003334, 0.006668])
+    with pytest.raises(ModelError, match=r"control_dt=0.003334, .* timestep=0.001667"):
+        read_recording(sw.World(PENDULUM), odd)
+    with pytest.raises(UnknownOption, match=r"timestep=0\.001667"):
+        sw.World(PENDULUM, control_dt=0.003334)
+    text = PENDULUM.replace("<worldbody>", '<option timestep="0.001667"/><worldbody>')
+    assert len(read_recording(sw.World(text, control_dt=0.003334), odd).runs) == 1
