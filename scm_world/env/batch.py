@@ -16,7 +16,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import iterate
 
 from scm_world._arguments import one_of, true_or_false, typed, whole_number
-from scm_world._types import ArrayLike, Floats, Integers, Mask
+from scm_world._types import ArrayLike, Floats, Integers, Mask, Observation
 from scm_world.env.actions import JOINTS
 from scm_world.env.arguments import RESETS, reset_options
 from scm_world.env.environment import EnvSnapshot, ScmWorldEnv, unwrapped_env
@@ -343,7 +343,9 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         self._write(row, *shown)
         return answer
 
-    def _write(self, rows: Places, observation: Any, info: Mapping[str, Any]) -> None:
+    def _write(
+        self, rows: Places, observation: Observation | None, info: Mapping[str, Any]
+    ) -> None:
         if isinstance(observation, dict):
             _put(self._observations, rows, observation, self.num_envs)
         elif observation is not None:

@@ -178,9 +178,9 @@ class Planned(CausalSystem):
             raise
 
     def _follow(self, schedule: _Schedule) -> None:
-        self._schedule, self.is_planned, self.plan_end = schedule, False, 0.0
-        if any(parts for _, parts in schedule.plan.layers()):
-            self.is_planned = True
+        self._schedule, self.plan_end = schedule, 0.0
+        self.is_planned = any(parts for _, parts in schedule.plan.layers())
+        if self.is_planned:
             self.plan_end = max((act.time.last for _, act in schedule.plan.timed()), default=0.0)
 
     def _may_act(self, step: int) -> bool:
@@ -520,7 +520,7 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         """
         from scm_world.fit import fit
 
-        options: Any = {"noise": noise, "window": window, "begins": begins}
+        options: dict[str, Any] = {"noise": noise, "window": window, "begins": begins}
         options |= {"held_out": held_out, "setups": setups, "progress": progress}
         options |= {"symmetric": symmetric, "columns": columns, "ignore": ignore}
         options |= {} if search is None else {"search": search}
@@ -568,7 +568,12 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         """
         from scm_world.fit import explain
 
-        options: Any = {"noise": noise, "window": window, "begins": begins, "setups": setups}
+        options: dict[str, Any] = {
+            "noise": noise,
+            "window": window,
+            "begins": begins,
+            "setups": setups,
+        }
         options |= {"columns": columns, "ignore": ignore, "most": most}
         return explain(self, recording, candidates, progress=progress, **options)
 
