@@ -11,7 +11,8 @@ is left, and its result, or why there is none, is written before the next one be
 - ``floor``: run-to-run floors over horizons, and the gaps to MuJoCo.
 - ``conformance``: the suite of every engine, test by test; what needs bits fails without them.
 - ``collect``: rows of episodes per second.
-- ``train``: PPO in many worlds for as long as there is time, then protocols on MuJoCo.
+- ``train``: PPO in many worlds, stepped on the device, for as long as there is time, and what is
+  computed on the host; then protocols on MuJoCo.
 
 A checkout is enough: ``pip install 'scm-world[warp,scale]' pytest`` from its folder, then this.
 """
@@ -249,7 +250,11 @@ def train(how: argparse.Namespace) -> Iterator[dict[str, Any]]:
     from scm_world.training.recipe import recipe
 
     made = recipe(how.task, "rsl_ppo", **how.recipe, trials={"protocols": []})
-    begun, done = time.perf_counter(), 0
+    begun, done, said = time.perf_counter(), 0, list[str]()
+
+    def note(text: str) -> None:
+        tell(text)
+        said.extend([text] if "on the host" in text else [])
 
     def watch(steps: int, _: int) -> None:
         nonlocal done
@@ -259,7 +264,7 @@ def train(how: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
     with tempfile.TemporaryDirectory() as folder:
         with suppress(KeyboardInterrupt):
-            trained(made, out=folder, backend=how.backend, progress=watch, tell=tell)
+            trained(made, out=folder, backend=how.backend, progress=watch, tell=note)
         spent = time.perf_counter() - begun
         curve = (Path(folder) / "progress.csv").read_text().splitlines()
         found = {
@@ -268,6 +273,7 @@ def train(how: argparse.Namespace) -> Iterator[dict[str, Any]]:
             "steps": done,
             "seconds": spent,
             "steps_per_s": done / spent,
+            "on_the_host": said,
             "curve": [curve[0], *curve[1 :: max(1, len(curve) // 20)]],
         }
         yield found

@@ -333,6 +333,7 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
         "package": "", "doc": "", "baseline": False, "marked": False,
     }  # fmt: skip
     yield discovery.collect, {"source": model, "design": design, "n": 2, "seed": 0, **store}
+    yield data.collect_parts, {"source": model, "design": design, "n": 2, "seed": 0, **store}
     yield (
         discovery.sweep,
         {"system": model, "over": {"a": [0.0]}, "outcomes": ["y"], "n": 2, **store},

@@ -127,9 +127,11 @@ class Scenes(ABC):
     Attributes:
         may_refuse: Whether a scene whose step fails can be as it was; if not, it has lost its
             state.
+        stays: Whether states may stay on a device; see ``resident``.
     """
 
     may_refuse: ClassVar[bool] = True
+    stays: ClassVar[bool] = False
 
     @abstractmethod
     def __init__(self, n: int, threads: int) -> None: ...

@@ -339,10 +339,7 @@ def collect(
         picture_size: Height and width of a picture in pixels.
         goal_pictures: Pictures of the goals, too.
     """
-    import pandas
-
-    from scm_world.discovery.data import Design, Pictures, default_causes
-    from scm_world.discovery.data import collect as collected
+    from scm_world.discovery.data import Design, Pictures, collect_parts, default_causes, load
     from scm_world.discovery.data.files import COUNT
     from scm_world.discovery.data.worlds import usual_shard
 
@@ -361,20 +358,25 @@ def collect(
             context["policy"] = setting["policy"]  # None: nothing acts
         targets = () if design == "observational" else target or cause or default_causes(system)
         plan = Design(design, tuple(targets), values, observational_fraction)
-        size = usual_shard(system) if shard is None else shard
-        with jobs.open("episodes", folder, "shard-*.*", f"of {-(-n // size)} files") as job:
-            found = collected(system, plan, n, seed=asked.seed, shard=shard, **job, **context)
-    first = found.rows(np.unique(found.episode, return_index=True)[1])
-    done = pandas.Series(first.targets).explode().map("do({})".format, na_action="ignore")
-    counts = done.fillna("no intervention").value_counts()
+        files = -(-n // (usual_shard(system) if shard is None else shard))
+        with jobs.open("episodes", folder, "shard-*.*", f"of {files} files") as job:
+            how = {"seed": asked.seed, "shard": shard, **job, **context}
+            done, size, refused = Counter[str](), Counter[str](), 0
+            for part in collect_parts(system, plan, n, **how):
+                kinds = part.regime[np.unique(part.episode, return_index=True)[1]]
+                size += Counter(episodes=len(kinds), rows=len(part))
+                refused += len(part.about.get("refused", ()))
+                for kind, count in Counter(kinds.tolist()).items():
+                    for name in part.regimes[kind].targets or ("",):
+                        done[f"do({name})" if name else "no intervention"] += count
     console.frame(
-        counts.rename_axis("").reset_index(name="episodes"),
-        title=f"Collected from {tag(task)} on {engine}, seed {asked.seed}: {len(first)} episodes, "
-        f"{len(found)} rows, {len(found.columns)} columns",
+        [{"": name, "episodes": count} for name, count in done.most_common()],
+        title=f"Collected from {tag(task)} on {engine}, seed {asked.seed}: {size['episodes']} "
+        f"episodes, {size['rows']} rows, {len(part.columns)} columns",
     )
-    if refusals := len(found.about.get("refused", ())):
-        console.say(f"{refusals} episodes were refused")
-    if contacts and found.truth is not None:
+    if refused:
+        console.say(f"{refused} episodes were refused")
+    if contacts and (found := load(folder)).truth is not None:
         acting, edges = found.acting().truth, len(found.truth.edges)
         could = len(acting.edges) if acting else 0
         console.say(f"{could} of {edges} edges could act in these rows")

@@ -519,6 +519,7 @@ def fit(
     do: options.Pairs = None,
     at: options.NotNegative = 0,
     run: options.NotNegative = 0,
+    save: list[Path] | None = None,
     asked: options.Asked,
 ) -> None:
     """Fit parameters of a world to recordings: tables of time, commands and measurements.
@@ -550,6 +551,8 @@ def fit(
         do: Intervention on a recorded run: its counterfactual measurements are written.
         at: Control step of this intervention.
         run: Number of this run.
+        save: File with the fitted values: .xml or .urdf (that of the system, with other numbers),
+            .yaml, or .html (a page).
     """
     known, size = parse_assignments(noise, "'--noise'") or None, window or None
     ranges, request = parse_assignments(limits, "'--limits'"), parse_assignments(do, "'--do'")
@@ -611,6 +614,9 @@ def fit(
     )
     files = {f"{name}.csv": table.to_csv(index=False) for name, table in tables.items()}
     console.write(folder, {**files, "fit.png": png(found.picture()), "result.json": result})
+    for path in save or ():
+        found.save(path)
+        console.say(f"written: {path}")
     if failed is not None:
         raise failed
     raise typer.Exit(int(not found.explains))

@@ -16,7 +16,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import iterate
 
 from scm_world._arguments import one_of, true_or_false, typed, whole_number
-from scm_world._types import ArrayLike, Floats, Integers, Mask
+from scm_world._types import ArrayLike, Floats, Integers, Mask, Observation
 from scm_world.env.actions import JOINTS
 from scm_world.env.arguments import RESETS, reset_options
 from scm_world.env.environment import EnvSnapshot, ScmWorldEnv, unwrapped_env
@@ -147,12 +147,10 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         try:
             self._act("reset", asked)
         except InterventionError:
-            if not any("do" in one.get("options", {}) for one in asked.values()):
-                raise
-            # The episodes begin without what was refused.
-            with suppress(InterventionError):  # what is done at every reset may be refused, too
-                self._act("reset", {index: _without_do(one) for index, one in asked.items()})
-                self._autoreset_envs[[*asked]] = False
+            given = [one.get("options", {}).pop("do", None) for one in asked.values()]
+            if any(one is not None for one in given):  # the episodes begin without it
+                with suppress(InterventionError):  # what is done at every reset may be refused, too
+                    self._reset(asked)
             raise
         self._autoreset_envs[[*asked]] = False
 
@@ -345,7 +343,9 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         self._write(row, *shown)
         return answer
 
-    def _write(self, rows: Places, observation: Any, info: Mapping[str, Any]) -> None:
+    def _write(
+        self, rows: Places, observation: Observation | None, info: Mapping[str, Any]
+    ) -> None:
         if isinstance(observation, dict):
             _put(self._observations, rows, observation, self.num_envs)
         elif observation is not None:
@@ -417,11 +417,11 @@ class ScmWorldVectorEnv(SyncVectorEnv):
             source: Index of the one that is copied.
             into: Index or indices of those that become like it; all if None.
         """
-        saved = self._snapshot(index_of(source, self.num_envs))
+        saved = self._snapshot(numbered(source, self.num_envs))
         given = range(self.num_envs) if into is None else into
         others: list[Any] = [*given] if isinstance(given, Iterable) else [given]
         if others:
-            self.restore({index_of(index, self.num_envs): saved for index in others})
+            self.restore(dict.fromkeys(others, saved))
 
 
 def _copied(
@@ -476,10 +476,9 @@ def infos_of(columns: Mapping[str, Any], which: Mask) -> dict[str, Any]:
 # --- arguments ------------------------------------------------------------------------------------
 
 
-def _without_do(arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arguments of a reset without its intervention."""
-    options = arguments.get("options", {})
-    return {**arguments, "options": {n: one for n, one in options.items() if n != "do"}}
+def numbered(index: object, size: int) -> int:
+    """Return the checked index of an environment."""
+    return whole_number("environment", index, least=0, most=size - 1)
 
 
 def spread(
@@ -495,7 +494,8 @@ def spread(
     """
     known = [*range(size)] if among is None else [*among]
     if isinstance(given, Mapping) and any(not isinstance(key, str) for key in given):
-        found = {index_of(key, size): one for key, one in given.items() if one is not None}
+        asked = ((index, one) for index, one in given.items() if one is not None)
+        found = {numbered(index, size): one for index, one in asked}
         if not found.keys() <= {*known}:
             raise UnknownOption(f"environments for {what}", [*found], ("those that are reset",))
         return found
@@ -506,10 +506,3 @@ def spread(
     if len(given) != size:
         raise UnknownOption(f"list for {what}", given, (f"one of length {size}",))
     return {index: given[index] for index in known if given[index] is not None}
-
-
-def index_of(index: object, size: int) -> int:
-    """Read the index of an environment."""
-    if not isinstance(index, int | np.integer) or isinstance(index, bool) or not 0 <= index < size:
-        raise UnknownOption("environment", index, (f"any whole number from 0 to {size - 1}",))
-    return int(index)

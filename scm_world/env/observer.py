@@ -71,7 +71,7 @@ class GoalVectors:
 
     def reward(self, achieved: ArrayLike, desired: ArrayLike) -> Floats:
         """Compute the part of the reward that goals alone decide; see ``goal_reward``."""
-        both: Any = finite_numbers(achieved), finite_numbers(desired)
+        both: tuple[Any, Any] = finite_numbers(achieved), finite_numbers(desired)
         for name, goal in zip(self.spaces, both, strict=True):
             if goal is None or goal.shape[-1:] != (self.size,):
                 given = achieved if name == "achieved_goal" else desired

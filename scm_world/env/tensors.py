@@ -11,7 +11,6 @@ from gymnasium.vector import VectorEnv
 
 from scm_world._arguments import load
 from scm_world._types import Integers, Mask
-from scm_world.backends import Scenes
 from scm_world.env.actions import JOINTS
 from scm_world.env.batch import ScmWorldVectorEnv
 from scm_world.env.observer import FAILED
@@ -84,7 +83,7 @@ class HostEnvs:
 def has_device(envs: Any) -> bool:
     """Return whether the engine of environments has states on a device."""
     batch = getattr(envs, "_batch", None)
-    return batch is not None and type(batch._engine).resident is not Scenes.resident
+    return batch is not None and batch._engine.stays
 
 
 @final
@@ -109,7 +108,9 @@ class TensorEnvs:
         torch = load("torch", "torch", "train")
         self._torch, self._envs, self._all = torch, envs, np.arange(envs.num_envs)
         self.copies: Counter[str] = Counter()
-        self._host_has = self._all[:0]
+        shown = envs._shown()
+        self._host_has = self._all
+        self.seen: Any = shown if isinstance(shown, dict) else torch.as_tensor(shown)
         self._kinds = envs._batch._groups(self._all)
         self.why_not = self._reason(self._all)
         if self.why_not:
@@ -151,6 +152,7 @@ class TensorEnvs:
         # Of each stream of noise: the column of its scale, how many numbers, whether there is any.
         self._noises = {n: [at.start, sizes[n], False] for n, at in columns.items()}
         self._where = np.zeros((envs.num_envs, 3), dtype=np.uint64)  # see ``uniforms``
+        self._host_has = self._all[:0]
         self._look(self._all)
 
     @property
@@ -310,5 +312,6 @@ class TensorEnvs:
 
     def leave(self) -> None:
         """Let the environments go on from here by themselves."""
-        self._to_host(np.setdiff1d(self._all, self._host_has))
+        if len(there := np.setdiff1d(self._all, self._host_has)):
+            self._to_host(there)
         self._envs._read_alone(self._all)

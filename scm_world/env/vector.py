@@ -263,5 +263,5 @@ class Vector:
 
 def box(low: Floats, high: Floats) -> gymnasium.spaces.Box[np.float32]:
     """Return a space of 32-bit floats."""
-    bounds: Any = (low.astype(np.float32), high.astype(np.float32))
+    bounds: tuple[Any, Any] = (low.astype(np.float32), high.astype(np.float32))
     return gymnasium.spaces.Box(*bounds, dtype=np.float32)

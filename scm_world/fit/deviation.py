@@ -317,7 +317,7 @@ class _Comparison:
             explained = any(map(_explains, self._fits.values()))
             if likely or place < (0 if around else FEWEST) or (place < MANY and not explained):
                 begin, enough = self._minima[around], ABANDON * least
-                how: Any = {"thorough": False, "enough": enough}
+                how: dict[str, Any] = {"thorough": False, "enough": enough}
                 minimum = self._search.found(active, begin, values=scaled, **how)
                 if minimum.loss <= enough:
                     self._keep(names, minimum)

@@ -107,7 +107,7 @@ def fit(
                 if attempt != 2 or max(found.misfit.values()) < CLEAR:
                     break
     more = "" if found.explains else reading_of(world, measured)
-    about: Any = {"later": later, "outliers": tuple(outliers), "reading": more}
+    about: dict[str, Any] = {"later": later, "outliers": tuple(outliers), "reading": more}
     return dataclasses.replace(found, shortened=attempt == 2, **about)
 
 

@@ -517,7 +517,11 @@ def _separated(data: bytes) -> pd.DataFrame:
         rows = [comments[-1].lstrip(" #%\t"), *rows]
     separator = next((one for one in ";\t," if one in (rows or [""])[0]), r"\s+")
     commas = separator != "," and any("," in line for line in rows[1:])
-    how: Any = {"sep": separator, "decimal": "," if commas else ".", "skipinitialspace": True}
+    how: dict[str, Any] = {
+        "sep": separator,
+        "decimal": "," if commas else ".",
+        "skipinitialspace": True,
+    }
     frame: pd.DataFrame = pd.read_csv(io.StringIO("\n".join(rows)), **how)
     return frame
 

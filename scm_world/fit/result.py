@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
@@ -37,6 +38,7 @@ from scm_world.fit.recordings import (
     columns_of,
     read_recording,
 )
+from scm_world.fit.saving import saved
 from scm_world.fit.shooting import Shooting
 from scm_world.fit.targets import (
     FAR,
@@ -450,6 +452,22 @@ class Fit:
             how = Reading(None, columns, ignore)
             return predicted(self, read_recording(twin, recording, how), ahead)
 
+    def save(self, path: str | Path) -> None:
+        """Write the fit to a file, as its ending says.
+
+        ``.xml`` and ``.urdf`` are the file that the world was made from, with the fitted numbers;
+        all else of it stays, comments too. It is read again before it is written, and all
+        parameters are compared. A delay is no part of it. ``.yaml`` has the values with their
+        intervals, the remarks and the replay. ``.html`` is a page with tables and
+        traces.
+
+        Raises:
+            UnknownOption: The file has another ending.
+            ModelError: The world was not made from a file, or a parameter is defined elsewhere than
+                in its own element, so that it cannot be written there; nothing is written.
+        """
+        saved(self, Path(path))
+
     @cached_property
     def held_out(self) -> Prediction | None:
         """The prediction of the rows that were held out, if there are such rows."""
@@ -609,11 +627,11 @@ class Fit:
         longest = max(len(run.commands) for run in self.runs)
         count = longest if steps is None else steps
         known = self.sensitivities / np.sqrt(self.discount)
-        how: Any = {"steps": count, "limits": limits, "seed": seed, "setups": setups}
+        how: dict[str, Any] = {"steps": count, "limits": limits, "seed": seed, "setups": setups}
         return suggested(self, known, n, **how)
 
     def counterfactual(
-        self, do: Mapping[str, object], *, at: int = 0, run: int = 0, draws: int = 32, seed: int = 0
+        self, do: Mapping[str, object], *, at: int = 0, run: int = 0, draws: int = 40, seed: int = 0
     ) -> pd.DataFrame:
         """Return the measurements of a recorded run as they would be under an intervention.
 
@@ -621,8 +639,8 @@ class Fit:
         between the start state of a window and the end of the window before come from causes that
         are not modelled. Both are added again, so that no intervention gives the recorded
         measurements. The interval is that of the parameters, which are drawn from
-        the covariance of the fit (from its prior where the recording determines nothing) with
-        their start states.
+        the covariance of the fit (from its prior where the recording determines nothing), and of
+        the start states, which are drawn given these. Ends are quantiles k : (n + 1) of n draws.
 
         Args:
             do: The intervention, without times: parameters from then on, states at that instant,
@@ -653,21 +671,31 @@ class Fit:
         away = rng.multivariate_normal(
             np.zeros(len(self.scaled)), spread, whole_number("draws", draws, least=2)
         )
-        scaled = np.vstack([self.scaled, np.clip(self.scaled + away, *ranges_of(self.targets))])
+        size = np.sqrt(self.degrees / rng.chisquare(self.degrees, (draws, 1)))  # Student's t
+        away = self.scaled + size * away
+        scaled = np.vstack([self.scaled, np.clip(away, *ranges_of(self.targets))])
         windows = windows_of(self.runs, self.window)
         mine = [w for w, one in enumerate(windows) if one.run == run]
+        errors = dict[int, Floats]()  # of start states, given the parameters
+        for w in mine:
+            _, sizes, right = self.found[w].fitted
+            free = size * rng.normal(size=(draws, len(sizes))) * np.sqrt(self.discount) / sizes
+            errors[w] = np.vstack([np.zeros(right.shape[1]), free @ right])
         with Shooting(self.asked, self.measured, self.targets) as shooting:
             shooting.spans, moved = self.spans, shooting.moved
             starts = [
-                [moved(self.starts[w], self.found[w].slopes @ (one - self.scaled)) for w in mine]
-                for one in scaled
+                [
+                    moved(self.starts[w], self.found[w].slopes @ (one - self.scaled) + errors[w][i])
+                    for w in mine
+                ]
+                for i, one in enumerate(scaled)
             ]
             which = [windows[w] for w in mine]
             plain, other = shooting.replay(which, scaled, np.array(starts), do, at)
             plain = aligned(plain, recorded.values, shooting.rotations)
             found = recorded.values + aligned(other, plain, shooting.rotations) - plain
         tails = 0.5 * (1.0 - CONFIDENCE)
-        ends = np.quantile(found[1:], (tails, 1.0 - tails), axis=0)
+        ends = np.quantile(found[1:], (tails, 1.0 - tails), axis=0, method="weibull")
         time = recorded.begin + self.measured.control_dt * recorded.instants
         names = [column.name for column in self.measured.recorded]
         about = {"time": np.tile(time, len(names)), "column": np.repeat(names, len(time))}

@@ -10,7 +10,7 @@ from typing import final
 
 import numpy as np
 
-from scm_world._patterns import as_names, fitting
+from scm_world._patterns import as_names, fits, fitting
 from scm_world._types import ArrayLike, Floats, Integers
 from scm_world.errors import NotIntervenable, UnknownOption, UnknownVariable
 from scm_world.fit.recordings import MeasuredNumber, labels, settable_of
@@ -148,8 +148,8 @@ def targets_of(
         pairs = ((n, np.array(world[n], float)) for n in known if model.declared(n).shape == (2,))
         mirrored = {name for name, (low, high) in pairs if -low == high > 0.0}
     refused = world.composition.system.refused
-    late = {f"{name}{LATE}" for name in world.compiled.actions}.difference(model)
-    late |= {DELAY}.difference(model) if world.compiled.n_actions else set()
+    late = [*(f"{name}{LATE}" for name in world.compiled.actions), DELAY]
+    late = [name for name in late if name not in model and world.compiled.n_actions]
     held = [name for name in world.compiled.actions if f"{name}_past" in model]
     for pattern in given:
         if not isinstance(pattern, str):
@@ -161,9 +161,11 @@ def targets_of(
         if pattern == DELAY and DELAY in late and held:
             own = ", ".join(f"{name}{LATE}" for name in held)
             raise NotIntervenable(DELAY, f"adds to delays that commands have already; fit {own}")
-        if pattern in late:
-            names[pattern] = None
-            continue
+        mine = [n for n in late if n == pattern or (n != DELAY and fits(n, (pattern,)))]
+        if pattern.endswith(DELAY) and mine:  # "*" means what the world has
+            names |= dict.fromkeys(mine)
+            if not any(fits(name, (pattern,)) for name in known):
+                continue
         found = fitting(pattern, known if pattern in known else {**known, **parts})
         for name in found:
             joint = name not in known or name in mirrored or _kind(world, name) == "inertia"

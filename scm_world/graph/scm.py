@@ -654,10 +654,10 @@ class SCM:
     def _instant(self, previous: Values, key: NoiseKey, step: int) -> dict[str, Value]:
         """Compute an instant, and the commands that are taken there: those of a control step."""
         values: dict[str, Value] = {}
-        declared: Any = self._declared
+        declared: Mapping[str, Any] = self._declared
         for commands, part in groupby(self._order, lambda n: declared[n].role == "action"):
             own, only = replace(key, step=step) if commands else key, [*part]
-            given: Any = {"previous": previous, "key": own, "begins": own.step < 0}
+            given: dict[str, Any] = {"previous": previous, "key": own, "begins": own.step < 0}
             values = self.solve(values, only=only, **given)
             for name in only if commands else ():
                 if (bounds := declared[name].bounds) is not None:

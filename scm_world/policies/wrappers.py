@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium.utils.env_checker import data_equivalence
 from numpy.typing import NDArray
 
-from scm_world._types import ArrayLike, Floats
+from scm_world._types import ArrayLike, Floats, Observation
 from scm_world.errors import ModelError, in_one_line
 
 NEUTRAL = (
@@ -138,7 +138,7 @@ def _tried(wrapper: Any) -> LinearMap | None:
     space = wrapper.env.single_observation_space if many else wrapper.env.observation_space
     actions = iter(samples(wrapper.action_space, 10_000, seed=1))
 
-    def show(observation: Any, *, begin: bool = False) -> Any:
+    def show(observation: Observation, *, begin: bool = False) -> Any:
         probe.shown = observation
         if begin:
             found = tried.reset()[0]
@@ -187,7 +187,7 @@ def _probe(env: Any, *, many: bool) -> Any:
     return probe
 
 
-def _batched(observation: Any, count: int) -> Any:
+def _batched(observation: Observation, count: int) -> Any:
     """Return an observation for each of many environments."""
     if isinstance(observation, dict):
         return {name: _batched(part, count) for name, part in observation.items()}

@@ -145,7 +145,7 @@ class Counterfactuals(Mapping[str, Floats]):
             raise UnknownOption("level", level, ("a number between 0 and 1",))
         found = self.counterfactual[name]
         weights, shares = np.broadcast_to(self._spread(found), found.shape), np.array([-0.5, 0.5])
-        how: Any = {"method": "inverted_cdf", "weights": weights}
+        how: dict[str, Any] = {"method": "inverted_cdf", "weights": weights}
         low, high = np.quantile(found, 0.5 + level * shares, axis=1, **how)
         return (low[0], high[0]) if self.one else (low, high)
 

@@ -36,7 +36,7 @@ ENOUGH = 0.25
 """Share of the draws that is enough as their effective number."""
 
 
-def scores_of(source: Any, noise: Floats) -> Floats:
+def scores_of(source: Normal | Box | Continuous, noise: Floats) -> Floats:
     """Return the scores of noise, shape (n, *shape); not finite where it is not continuous."""
     with np.errstate(divide="ignore", invalid="ignore"):
         if isinstance(source, Normal):
@@ -46,7 +46,7 @@ def scores_of(source: Any, noise: Floats) -> Floats:
     return np.asarray(np.where(below < 0.0, below, above).clip(-FARTHEST, FARTHEST))
 
 
-def noise_of(source: Any, scores: Floats) -> Floats:
+def noise_of(source: Normal | Box | Continuous, scores: Floats) -> Floats:
     """Return the noise of scores, exact in both tails."""
     if isinstance(source, Normal):
         return np.asarray(source.mean + source.std * scores)

@@ -278,7 +278,7 @@ class Twins:
         found = list[Result]()
         for rows in plans.values():
             mine = [units[row] for row in rows]
-            how: Any = {"seed": [unit.seed for unit in mine], "names": ()}
+            how: dict[str, Any] = {"seed": [unit.seed for unit in mine], "names": ()}
             how["seed"] = how["seed"][0] if len({*how["seed"]}) == 1 else how["seed"]
             how["number"] = [unit.number for unit in mine]
             how["policy"] = lambda it, taken=actions[rows]: taken[:, it.index]

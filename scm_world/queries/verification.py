@@ -592,8 +592,8 @@ def _reasons(world: Simulation | None, effects: Effects) -> Callable[[Edge], str
                 return f"the command {action} was saturated {sought}"
         size, room = effects.largest.get(edge.key, 0.0), effects.rounding.get(edge.effect, 0.0)
         if size > 0.0 and room:
-            by = f"by {room:.2g} of it or of 1"
-            return f"at most {size:.2g}: bodies that do not touch change {edge.effect} {by}, too"
+            others = f"bodies that do not touch change {edge.effect} by {room:.2g}"
+            return f"it changed by {effects.relative[edge.key]:.2g} of it or of 1, and {others}"
         beyond = " beyond rounding and noise" * (size > 0.0)
         found = f"no difference{beyond}, though {cause} was changed in {states} of the probe states"
         return found + f", and contacts joined their bodies in {touched}" * (touched > 0)

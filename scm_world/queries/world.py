@@ -520,7 +520,7 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         """
         from scm_world.fit import fit
 
-        options: Any = {"noise": noise, "window": window, "begins": begins}
+        options: dict[str, Any] = {"noise": noise, "window": window, "begins": begins}
         options |= {"held_out": held_out, "setups": setups, "progress": progress}
         options |= {"symmetric": symmetric, "columns": columns, "ignore": ignore}
         options |= {} if search is None else {"search": search}
@@ -568,7 +568,12 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         """
         from scm_world.fit import explain
 
-        options: Any = {"noise": noise, "window": window, "begins": begins, "setups": setups}
+        options: dict[str, Any] = {
+            "noise": noise,
+            "window": window,
+            "begins": begins,
+            "setups": setups,
+        }
         options |= {"columns": columns, "ignore": ignore, "most": most}
         return explain(self, recording, candidates, progress=progress, **options)
 

@@ -25,7 +25,7 @@ from scm_world.queries import World
 from scm_world.runs.processes import Worker
 from scm_world.variables import Box, Categories, Draw, Integers, Noise, Rotations, Scale
 from scm_world.variables.reserved import CONTROL_INDEX
-from scm_world.world import Batch, Simulation
+from scm_world.world import Batch, Simulation, Snapshot
 
 __all__ = ["check_model"]
 
@@ -88,7 +88,7 @@ def trajectory(world: Simulation, taken: Floats) -> Floats:
     return np.stack(found)
 
 
-def future(world: Simulation, snapshot: Any) -> list[bytes]:
+def future(world: Simulation, snapshot: Snapshot) -> list[bytes]:
     """List what follows a snapshot, and two episodes with all kinds of interventions."""
     world.restore(snapshot)
     seen = [trajectory(world, actions(world, 20, 7)).tobytes()]

@@ -7,7 +7,6 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
-from datetime import timedelta
 from pathlib import Path
 from typing import Any, final
 
@@ -20,7 +19,6 @@ from scm_world.env.observer import FAILED
 from scm_world.errors import (
     Diverged,
     ScmWorldError,
-    UnknownOption,
     UnwritableFolder,
     in_one_line,
 )
@@ -28,19 +26,12 @@ from scm_world.policies import MlpPolicy, save_policy
 from scm_world.queries.progress import Progress, Tell
 from scm_world.runs.files import make_folder, read_arrays
 from scm_world.runs.study import Study
-from scm_world.training.export import Evaluations, begin_with, exported
+from scm_world.training.export import begin_with, exported
 from scm_world.training.recipe import Recipe
+from scm_world.training.rounds import Rounds, restore_last
 from scm_world.training.sb3 import Sb3VecEnv
 from scm_world.training.settings import Rate
-from scm_world.training.worlds import (
-    CHECKPOINTS,
-    LINES,
-    SEEDS,
-    SUCCESS,
-    is_due,
-    make_envs,
-    scales,
-)
+from scm_world.training.worlds import SEEDS, SUCCESS, make_envs, scales
 
 try:
     import stable_baselines3
@@ -94,9 +85,6 @@ def make_worlds(recipe: Recipe, *, backend: str, threads: int | None = None) -> 
     envs = make_envs(recipe, backend=backend, threads=threads)
     try:
         vec_env = Sb3VecEnv(envs, [])
-        if not isinstance(vec_env.action_space, gymnasium.spaces.Box):
-            allowed = ("a Box of numbers: of choices, learn with make_sb3 and the library itself",)
-            raise UnknownOption("actions of a policy", vec_env.action_space, allowed)
         (there,) = vec_env.get_attr("info_shapes", 0)
         vec_env.names = tuple(name for name in (SUCCESS, FRACTION, FAILED) if name in there)
         (length,) = vec_env.get_attr("limit", 0)
@@ -239,38 +227,41 @@ def _remember(model: BaseAlgorithm, path: Path) -> None:
         buffer.dones[buffer.pos - 1, begun] = buffer.timeouts[buffer.pos - 1, begun] = 1.0
 
 
-def resume(model: BaseAlgorithm, study: Study, tell: Tell) -> None:
-    """Restore the last checkpoint of ``save_checkpoint``, and the number of steps.
+def restore(model: BaseAlgorithm, content: bytes, steps: int, memory: Path) -> str:
+    """Restore what ``save_checkpoint`` wrote, and the number of steps.
 
     Only tensors and arrays are read, which runs no code.
+
+    Returns:
+        What is not as before, in words.
     """
-    folder = Path(str(study.path("checkpoints")))
-    found = {int(path.stem.split("_")[1]): path for path in folder.glob("run_*.zip")}
-    for steps, path in sorted(found.items(), reverse=True):
-        try:
-            archive = io.BytesIO(study.kept(f"checkpoints/{path.name}", bytes))
-            _, parameters, variables = load_from_zip_file(archive, device="cpu", load_data=False)
-            model.set_parameters(parameters, exact_match=True, device=model.device)
-            for name, tensor in (variables or {}).items():
-                recursive_setattr(model, f"{name}.data", tensor.data.to(model.device))
-        except Exception as error:  # of many kinds: torch, pickle, zip, Stable-Baselines3
-            tell(f"{path} is damaged, and the checkpoint before it is taken: {error}")
-            continue
-        model.num_timesteps = steps
-        if isinstance(model, stable_baselines3.PPO) and not callable(model.learning_rate):
-            model.learning_rate = model.policy.optimizer.param_groups[0]["lr"]  # it may adapt
-            model._setup_lr_schedule()
-        said = f"goes on after {steps:,} steps"
-        if _remembered(model):
-            try:
-                _remember(model, folder / f"memory_{steps}.npz")
-            except Exception as error:
-                said += f" without its memory ({in_one_line(error)}), which is filled anew"
-                if hasattr(model, "learning_starts"):
-                    said += f" by {model.learning_starts:,} random steps"
-                    model.learning_starts += steps
-        tell(said)
-        return
+    _, parameters, variables = load_from_zip_file(
+        io.BytesIO(content), device="cpu", load_data=False
+    )
+    model.set_parameters(parameters, exact_match=True, device=model.device)
+    for name, tensor in (variables or {}).items():
+        recursive_setattr(model, f"{name}.data", tensor.data.to(model.device))
+    model.num_timesteps = steps
+    if isinstance(model, stable_baselines3.PPO) and not callable(model.learning_rate):
+        model.learning_rate = model.policy.optimizer.param_groups[0]["lr"]  # it may adapt
+        model._setup_lr_schedule()
+    if not _remembered(model):
+        return ""
+    try:
+        _remember(model, memory)
+    except Exception as error:
+        said = f" without its memory ({in_one_line(error)}), which is filled anew"
+        if hasattr(model, "learning_starts"):
+            said += f" by {model.learning_starts:,} random steps"
+            model.learning_starts += steps
+        return said
+    return ""
+
+
+def resume(model: BaseAlgorithm, study: Study, tell: Tell) -> None:
+    """Restore the last checkpoint."""
+    place = Path(str(study.path("checkpoints")))
+    restore_last(study, lambda it, at: restore(model, it, at, place / f"memory_{at}.npz"), tell)
 
 
 @contextmanager
@@ -366,20 +357,19 @@ class Watch(BaseCallback):
         tell: Tell,
     ) -> None:
         super().__init__()
-        self.recipe, self._study, self._backend = recipe, study, backend
-        self._folder = Path(str(study.folder))
-        self._card, self._progress, self._tell = dict(card), progress, tell
+        self.recipe, self._study, self._card, self._tell = recipe, study, dict(card), tell
         self._over = self._failed = 0  # episodes since the training began or was resumed
-        self._scores = Evaluations(recipe, backend, self._folder)
+        about: dict[str, Any] = {"backend": backend, "progress": progress, "tell": tell}
+        self._rounds = Rounds(recipe, study, **about, save=self.save, policy=self._policy)
 
     @property
     def score(self) -> float | None:
         """The best score so far."""
-        return self._scores.best
+        return self._rounds.scores.best
 
     def _on_training_start(self) -> None:
         self._seen = self.model.num_timesteps
-        self._told = time.perf_counter(), self._seen
+        self._rounds.begin(self._seen)
         self._prepare()
 
     def _on_rollout_start(self) -> None:
@@ -407,11 +397,11 @@ class Watch(BaseCallback):
     def save(self) -> None:
         """Write a checkpoint and the policy."""
         save_checkpoint(self.model, self._study)
-        save_policy(self._folder / "policy.safetensors", self._policy())
+        save_policy(Path(str(self._study.folder)) / "policy.safetensors", self._policy())
 
     def _look(self) -> None:
         """Check a round; adapt the rate, write curves and checkpoints, evaluate if it is time."""
-        steps, before, recipe = self.model.num_timesteps, self._seen, self.recipe
+        steps, recipe = self.model.num_timesteps, self.recipe
         self._seen = steps
         if not self.is_finite:
             raise Diverged(steps)
@@ -429,22 +419,8 @@ class Watch(BaseCallback):
                 found = float(np.mean([episode[name] for episode in recent]))
                 self.logger.record(f"rollout/{name}", found)
         self.logger.record("time/cpu_seconds", time.process_time())
-        if self._progress is not None:
-            self._progress(min(steps, recipe.steps), recipe.steps)
-        now = time.perf_counter()
-        if now - self._told[0] >= LINES and steps > self._told[1]:
-            rate = (steps - self._told[1]) / (now - self._told[0])
-            self._told = now, steps
-            self._tell(self._line(steps, rate))
-
-        if is_due(CHECKPOINTS, before, steps, recipe) and steps < recipe.steps:
-            self.save()  # there is one at the end
-        if recipe.trials.protocols and is_due(recipe.trials.times, before, steps, recipe):
-            begun = time.perf_counter()
-            self._tell(f"{steps:,} steps: {self._scores.add(self._policy(), steps)}")
-            for name, value in self._scores.last.items():
-                self.logger.record(f"evaluation/{name}", value)
-            self._told = self._told[0] + time.perf_counter() - begun, self._told[1]
+        for name, value in self._rounds.look(steps, self._about()).items():
+            self.logger.record(f"evaluation/{name}", value)
 
     @property
     def is_finite(self) -> bool:
@@ -465,18 +441,15 @@ class Watch(BaseCallback):
             with torch.no_grad():
                 policy.log_std.clamp_(max=first + done * (recipe.network.log_std_end - first))
 
-    def _line(self, steps: int, rate: float) -> str:
-        """Describe the last episodes, and the speed, in a line."""
-        episodes, solved, said = self.model.ep_info_buffer, self.model.ep_success_buffer, []
+    def _about(self) -> Iterator[str]:
+        """Describe the last episodes."""
+        episodes, solved = self.model.ep_info_buffer, self.model.ep_success_buffer
         if episodes:
-            said.append(f"return {np.mean([episode['r'] for episode in episodes]):.3g}")
+            yield f"return {np.mean([episode['r'] for episode in episodes]):.3g}"
         if solved:
-            said.append(f"success {np.mean(solved):.2f}")
+            yield f"success {np.mean(solved):.2f}"
         if self._failed:
-            said.append(self._failures)
-        left = max(self.recipe.steps - steps, 0) / rate
-        said.append(f"{rate:,.0f} steps per second, about {timedelta(seconds=round(left))} left")
-        return f"{steps:,} of {self.recipe.steps:,} steps: {', '.join(said)}"
+            yield self._failures
 
     def _policy(self) -> MlpPolicy:
         card = {**self._card, "steps": self.model.num_timesteps}

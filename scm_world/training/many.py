@@ -8,7 +8,6 @@ import time
 from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
-from datetime import timedelta
 from pathlib import Path
 from typing import Any, final
 
@@ -23,10 +22,11 @@ from scm_world.policies.cards import OPTIONS
 from scm_world.queries.progress import Progress, Tell
 from scm_world.runs.files import make_folder, write_whole
 from scm_world.runs.study import Study
-from scm_world.training.export import Evaluations, begin_tensors
+from scm_world.training.export import begin_tensors
 from scm_world.training.recipe import Recipe
+from scm_world.training.rounds import Rounds, restore_last
 from scm_world.training.settings import Ppo
-from scm_world.training.worlds import CHECKPOINTS, LINES, SEEDS, SUCCESS, is_due, make_envs, scales
+from scm_world.training.worlds import SEEDS, SUCCESS, make_envs, scales
 
 try:
     import torch
@@ -277,10 +277,10 @@ class ManyPpo:
         torch.save({**self._ppo.save(), "rewards": self._moments}, file := io.BytesIO())
         return file.getvalue()
 
-    def restore(self, content: bytes, steps: int) -> None:
+    def restore(self, content: bytes, steps: int) -> str:
         """Restore what ``state`` returned, after so many control steps; episodes begin anew.
 
-        Only tensors are read, which runs no code.
+        Only tensors are read, which runs no code. Nothing else is to be said of it.
         """
         found = torch.load(io.BytesIO(content), map_location=self.device, weights_only=True)
         self._ppo.load(found, None, strict=True)
@@ -288,6 +288,7 @@ class ManyPpo:
         self.num_timesteps = steps
         torch.manual_seed(self._seed + steps)
         self._seed += steps  # other episodes than those before
+        return ""
 
 
 @contextmanager
@@ -327,8 +328,7 @@ def learn(
         UnwritableFolder: The disk is full, or permission is missing.
     """
     folder = Path(str(study.folder))
-    checkpoints = Path(str(make_folder(study.path("checkpoints"))))
-    scores = Evaluations(recipe, backend, folder)
+    make_folder(study.path("checkpoints"))
 
     def policy() -> MlpPolicy:
         return model.policy({**card, "steps": model.num_timesteps})
@@ -337,53 +337,29 @@ def learn(
         study.keep(f"checkpoints/run_{model.num_timesteps}_steps.zip", model.state())
         save_policy(folder / "policy.safetensors", policy())
 
-    resume(model, study, checkpoints, tell)
+    restore_last(study, model.restore, tell)
     first = model.num_timesteps
     curve, rows = folder / (f"progress-{first}.csv" if first else "progress.csv"), []
-    reported, before = time.perf_counter(), first
+    how: dict[str, Any] = {"backend": backend, "progress": progress, "tell": tell}
+    rounds = Rounds(recipe, study, **how, save=save, policy=policy)
+    rounds.begin(first)
     try:
         while model.num_timesteps < recipe.steps:
-            then = model.num_timesteps
-            losses = model.round()
+            losses, recent = model.round(), dict(_recent(model))
             while model.news:
                 tell(model.news.pop(0))
-            steps, now = model.num_timesteps, time.perf_counter()
-            rows.append({**dict(_recent(model)), **{f"train/{n}": v for n, v in losses.items()}})
+            steps = model.num_timesteps
+            rows.append({**recent, **{f"train/{n}": v for n, v in losses.items()}})
             rows[-1] |= {"time/total_timesteps": steps, "time/cpu_seconds": time.process_time()}
-            if progress is not None:
-                progress(min(steps, recipe.steps), recipe.steps)
-            if now - reported >= LINES:
-                rate = (steps - before) / (now - reported)
-                left = timedelta(seconds=round(max(recipe.steps - steps, 0) / rate))
-                means = {name.partition("/")[2]: value for name, value in _recent(model)}
-                said = ", ".join(f"{name} {value:.3g}" for name, value in means.items())
-                speed = f"{rate:,.0f} steps per second, about {left} left"
-                tell(f"{steps:,} of {recipe.steps:,} steps: {said}, {speed}")
-                reported, before = now, steps
-            if steps < recipe.steps and is_due(CHECKPOINTS, then, steps, recipe):
-                save()
-            if recipe.trials.protocols and is_due(recipe.trials.times, then, steps, recipe):
-                tell(f"{steps:,} steps: {scores.add(policy(), steps)}")
+            means = {name.partition("/")[2]: value for name, value in recent.items()}
+            rounds.look(steps, (f"{name} {value:.3g}" for name, value in means.items()))
     finally:  # also after Ctrl-C
         if rows:
             _write(curve, rows)
             save()
     if model.failed:
         tell(f"{model.failed:,} of {model.over:,} episodes ended as states grew beyond all bounds")
-    return scores.best
-
-
-def resume(model: ManyPpo, study: Study, checkpoints: Path, tell: Tell) -> None:
-    """Restore the last whole checkpoint."""
-    found = {int(path.stem.split("_")[1]): path for path in checkpoints.glob("run_*.zip")}
-    for steps, path in sorted(found.items(), reverse=True):
-        try:
-            model.restore(study.kept(f"checkpoints/{path.name}", bytes), steps)
-        except Exception as error:  # of many kinds: torch, pickle, zip, sums
-            tell(f"{path} is damaged, and the checkpoint before it is taken: {error}")
-            continue
-        tell(f"goes on after {steps:,} steps")
-        return
+    return rounds.scores.best
 
 
 def _recent(model: ManyPpo) -> Iterator[tuple[str, float]]:

@@ -310,12 +310,15 @@ def recipe(
 
 
 def usual_algorithm(backend: str | None) -> str:
-    """Return the algorithm that is used on an engine if none is named."""
-    scenes = None
-    if backend is not None:
-        with closing(make_backend(backend)) as engine:
-            scenes = engine.capabilities.scenes
-    return "ppo" if scenes is None else "rsl_ppo"
+    """Return the algorithm that is used on an engine if none is named.
+
+    An engine that steps many worlds best, and has their states on a device, has the one for them.
+    """
+    if backend is None:
+        return "ppo"
+    with closing(make_backend(backend)) as engine:
+        many = engine.capabilities.scenes is not None and engine.batch.stays
+    return "rsl_ppo" if many else "ppo"
 
 
 def _made_task(task: str, env: Mapping[str, Any] | None) -> Task:

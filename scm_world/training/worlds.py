@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 
 from scm_world._arguments import load, one_of
@@ -17,8 +18,6 @@ from scm_world.errors import UnknownOption
 from scm_world.training.recipe import Recipe
 
 SUCCESS = "is_success"
-CHECKPOINTS = 20  # of a training, evenly spread
-LINES = 10.0  # [s] between lines about the training
 
 SEEDS = 1_000_003
 """Between the noises of two seeds, which have one for each world; evaluations have those below."""
@@ -39,10 +38,13 @@ def make_envs(recipe: Recipe, *, backend: str, threads: int | None = None) -> An
     """Make the environments of a recipe, in which the next episode begins in the same step.
 
     A backend that steps many worlds in one call has ``threads``, another one as many processes.
+
+    Raises:
+        UnknownOption: Actions are choices, which policies of files do not have.
     """
     several = "workers" if backend == "bullet" else "threads"
     ids = {task: name for name, task in IDS.items()}
-    return make_vec(
+    envs: Any = make_vec(
         ids.get(recipe.task, ids["general"]),  # the task decides, not the id
         recipe.worlds,
         as_curriculum(recipe.curriculum),
@@ -52,6 +54,11 @@ def make_envs(recipe: Recipe, *, backend: str, threads: int | None = None) -> An
         **{several: threads},
         **{"on_failure": "truncate", **recipe.trained_in},
     )
+    if not isinstance(envs.single_action_space, Box):
+        envs.close()
+        allowed = ("a Box of numbers: of choices, learn with make_sb3 and the library itself",)
+        raise UnknownOption("actions of a policy", envs.single_action_space, allowed)
+    return envs
 
 
 def scales(layout: Mapping[str, Any], space: Any, env: Mapping[str, Any]) -> Floats:
@@ -83,8 +90,3 @@ def device_for(recipe: Recipe, device: str) -> str:
     if device == "cuda" and not has_gpu:
         raise UnknownOption("device", device, ("cpu: torch finds no GPU here",))
     return "cuda" if has_gpu and (device == "cuda" or recipe.algo != "ppo") else "cpu"
-
-
-def is_due(times: int, before: int, now: int, recipe: Recipe) -> bool:
-    """Return whether one of so many evenly spread times lies between two numbers of steps."""
-    return times * now // recipe.steps > times * before // recipe.steps

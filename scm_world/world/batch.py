@@ -111,11 +111,7 @@ class WorldsInRows(ABC):
     ) -> Audits: ...
 
     def _numbered(self, index: int) -> int:
-        row = whole_number("world", index, least=0)
-        if row >= len(self):
-            allowed = (f"any whole number from 0 to {len(self) - 1}",)
-            raise UnknownOption("world", index, allowed)
-        return row
+        return whole_number("world", index, least=0, most=len(self) - 1)
 
     def __enter__(self) -> Self:
         return self
@@ -693,7 +689,9 @@ class Batch(WorldsInRows):
         mask = read_mask("where", where, len(self))
         shape = len(self), self._first.compiled.n_actions
         given = read_actions(actions, mask, shape, "world")
-        each: Any = {row: self._worlds[row] for row in self._existing(np.flatnonzero(mask))}
+        each: dict[int, Any] = {
+            row: self._worlds[row] for row in self._existing(np.flatnonzero(mask))
+        }
         due = [row for row, one in each.items() if one.is_planned and one._may_act(one.index)]
         if due:
             self._everywhere(np.array(due), lambda row: each[row].act())
@@ -857,7 +855,7 @@ class Batch(WorldsInRows):
 
     def _groups(self, rows: Integers) -> list[tuple[tuple[CompiledTask, int], Integers]]:
         """Group worlds by structure and number of physics steps; fill the rows of changed ones."""
-        there: Any = self._worlds
+        there: Sequence[Any] = self._worlds
         changed = [n for n in self._existing(rows) if there[n].version != self._versions[n]]
         for row in changed:
             self._fill(row)

@@ -476,8 +476,12 @@ class Equations(CausalSystem):
     def snapshot(self) -> Snapshot:
         """Return everything that determines the future. It can be pickled."""
         self._now()
-        present: Any = self.graph, {name: getattr(self, name) for name in PRESENT}, None
-        where: Any = {"index": self.index, "seed": self.noise.seed, "episode": self.episode}
+        present: tuple[Any, ...] = self.graph, {name: getattr(self, name) for name in PRESENT}, None
+        where: dict[str, Any] = {
+            "index": self.index,
+            "seed": self.noise.seed,
+            "episode": self.episode,
+        }
         where["world"] = (self.model,)
         return Snapshot(*present, **where)
 
@@ -531,7 +535,12 @@ class Equations(CausalSystem):
             values |= {name: self._each[name] for name in some if name in self._each}
             only = [name for name in some if name not in self._each] if self._each else some
             key = NoiseKey(self.noise, self.episode, step, self._count)
-            given: Any = {"previous": self._before, "key": key, "only": only, "begins": starts}
+            given: dict[str, Any] = {
+                "previous": self._before,
+                "key": key,
+                "only": only,
+                "begins": starts,
+            }
             solved = self.graph.solve(values, **given)
             for name in some:
                 value, shape = solved[name], (*self._lead, *shapes[name])

@@ -156,7 +156,7 @@ class Transaction:
         moving = self._refused_mechanisms(computing) if computing else {}
         self.problems += {problem.variable: problem for problem in moving.values()}.values()
         self._impossible = {*moving}  # what has no possible value
-        self._boxes: Any = (), ()  # draws from boxes that follow nothing; see ``boxes``
+        self._boxes: tuple[Any, Any] = (), ()  # draws from boxes that follow nothing; see ``boxes``
         self.draws: list[str] = []
         self.changed: list[str] = []
         self._targets: tuple[str, ...] = ()

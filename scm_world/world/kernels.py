@@ -28,7 +28,7 @@ _WHERE = types.int64[:, ::1]
 _HEAD = (types.int64, VECTOR, _WHERE)
 
 
-def _read_number(row: Any, where: Any, i: int) -> Any:
+def _read_number(row: Floats, where: Integers, i: int) -> Any:
     return row[where[i, 0]]
 
 
@@ -65,15 +65,15 @@ COMPILING = _Compiling()
 _events.register("numba:compile", COMPILING)
 
 
-def _read_vector(row: Any, where: Any, i: int) -> Any:
+def _read_vector(row: Floats, where: Integers, i: int) -> Any:
     return row[where[i, 0] : where[i, 1]]
 
 
-def _write_number(row: Any, where: Any, i: int, value: Any) -> None:
+def _write_number(row: Floats, where: Integers, i: int, value: float) -> None:
     row[where[i, 0]] = value
 
 
-def _write_vector(row: Any, where: Any, i: int, value: Any) -> None:
+def _write_vector(row: Floats, where: Integers, i: int, value: Floats) -> None:
     first, length = where[i, 0], where[i, 1] - where[i, 0]
     if len(value) != length:
         raise ValueError("a compiled mechanism gave a vector of another length than declared")
@@ -114,7 +114,7 @@ def _called(typing: Any, address: Any, row: Any, where: Any, kinds: Any, result:
 _call: Any = intrinsic(_called)
 
 
-def _adapter(address: Any, row: Any, where: Any, kinds: Any, result: Any) -> None:
+def _adapter(address: int, row: Floats, where: Integers, kinds: object, result: object) -> None:
     _call(address, row, where, kinds, result)
 
 
@@ -122,7 +122,9 @@ _LIKE = _types.TypeRef(_types.Tuple((NUMBER,))), _types.TypeRef(NUMBER)
 """Types have no value at run time, so the adapters of all signatures are called alike."""
 
 
-def _adapted(typing: Any, adapter: Any, address: Any, row: Any, where: Any) -> Any:
+def _adapted(
+    typing: object, adapter: types.Type, address: object, row: object, where: object
+) -> Any:
     """Call an adapter at its address."""
 
     def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:

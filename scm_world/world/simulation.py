@@ -787,7 +787,9 @@ def _another(
     return kind(copy.copy(task) if structures is None else structures, **options)
 
 
-def _copied(kind: Any, task: Task, options: Mapping[str, Any], snapshot: Any) -> Any:
+def _copied(
+    kind: type[Simulation], task: Task, options: Mapping[str, Any], snapshot: Snapshot | None
+) -> Simulation:
     world = kind(task, **options)
     if snapshot is not None:
         world.restore(snapshot)

@@ -134,7 +134,7 @@ class Snapshot:
         return file.getvalue()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        there: Any = {"index": self.index, "world": self.world, "memory": self.memory}
+        there: dict[str, Any] = {"index": self.index, "world": self.world, "memory": self.memory}
         empty: Any = dict.fromkeys(("model", "row", "structure"))
         return partial(Snapshot, **empty, **there, content=self.sealed()), ()
 

@@ -126,7 +126,7 @@ def test_a_missing_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_an_agent_is_trained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What is done is said before and on the way; at the end, where the policy is."""
     pytest.importorskip("stable_baselines3")
-    monkeypatch.setattr("scm_world.training.algorithms.LINES", 0.0)
+    monkeypatch.setattr("scm_world.training.rounds.LINES", 0.0)
     folder = tmp_path / "run"
     short = (*SMALL, "--set=episode_length=5")
     found = called("pushing", *short, f"--out={folder}")

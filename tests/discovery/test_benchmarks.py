@@ -531,7 +531,7 @@ def test_no_process_outlives_one_that_was_killed(tmp_path: Path) -> None:
     process = started(tmp_path / "out", marks, "user_learners:busy")
     wait_for(lambda: len(pids(marks)) == 2)
     process.kill()
-    process.communicate()
+    process.communicate(timeout=60)
     wait_for(lambda: not any(map(is_alive, pids(marks))), 10.0)
     assert not list((tmp_path / "out").rglob("runs/**/*.json"))
 
@@ -544,7 +544,7 @@ def test_a_benchmark_that_was_killed_resumes(tmp_path: Path) -> None:
     process = started(out, marks, learners)
     wait_for(lambda: len(files(out)) >= 2 if out.exists() else False)
     process.kill()
-    process.communicate()
+    process.communicate(timeout=60)
     wait_for(lambda: not any(map(is_alive, pids(marks))), 10.0)
     kept = files(out)
     for path in kept:
@@ -571,6 +571,7 @@ def test_ctrl_c_ends_a_benchmark_at_once(tmp_path: Path) -> None:
     _, said = process.communicate(timeout=20)
     assert process.returncode != 0
     assert said.decode().rstrip().endswith("KeyboardInterrupt")
+    assert "SpawnProcess" not in said.decode()  # workers say nothing
     assert not any(map(is_alive, pids(marks)))
     assert files(out) == {}
     assert [path.name for path in out.iterdir()] == ["study.json"]

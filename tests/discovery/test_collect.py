@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from scm_world import SCM, Box, Derived, Exogenous, Linear
+from scm_world.backends import Capabilities
 from scm_world.discovery import evaluate, learn, problem
 from scm_world.discovery.data import (
+    Dataset,
     Design,
     collect,
+    collect_parts,
     default_causes,
     default_outcomes,
 )
@@ -24,7 +28,7 @@ from scm_world.errors import (
     UnknownVariable,
 )
 from scm_world.queries import Outcome, World
-from scm_world.variables import Affine, Draw, Normal, Parent, Shift
+from scm_world.variables import Affine, Draw, Hard, Normal, Parent, Shift
 
 MASS, FRICTION = "tool_block.mass", "floor_friction"
 
@@ -202,6 +206,44 @@ def test_order_shards_and_workers_do_not_matter(world: World) -> None:
     with pytest.raises(UnknownOption, match="at most 512,000,000 in files"):
         collect(world, design, 10**30)
     assert collect(world, design, 12, seed=2, **how) != whole
+
+
+@pytest.mark.parametrize("most", [512, 3])
+def test_whole_batches_are_single_episodes(monkeypatch: pytest.MonkeyPatch, most: int) -> None:
+    """Acts in mid-episode, draws and refusals, read as arrays, are what each rollout says."""
+    few = Capabilities(physics=False, scenes=most)
+    monkeypatch.setattr("scm_world.backends.fake.FakeBackend.capabilities", few)
+    late = {"gravity": Hard([0, 0, -5.0], at=3), FRICTION: Shift(0.05, during=(2, 4))}
+    given, place = World("pushing", backend="fake").given(late), "tool_block.cartesian_position"
+    values = {MASS: "B", FRICTION: Draw("A"), place: [0.0, 0.0, 0.001], "block.size": "A"}
+    design, how = Design("single", tuple(values), values, 0.2), ("sum", "mean", "max", "change")
+    outcomes = ["reward", *(Outcome(place, one) for one in how), Outcome("action", "sum", 2)]
+    circumstances: Any = {"steps": 6, "causes": [FRICTION, "gravity"], "outcomes": outcomes}
+    found = collect(given, design, 24, seed=2, **circumstances)
+    refused, rows = found.about["refused"], iter(found.values)
+    for number in range(24):
+        plan = design.regime(number, seed=2).plan
+        if str(number) in refused:
+            assert place in plan
+            with pytest.raises(InterventionError) as error:
+                given.rollout("random", seed=2, episode=number, steps=6, do=plan)
+            assert str(error.value) == refused[str(number)]
+            continue
+        episode = given.rollout("random", seed=2, episode=number, steps=6, do=plan)
+        there = episode[place]
+        summed, mean, most_of = there[1:].sum(axis=0), there[1:].mean(axis=0), there[1:].max(axis=0)
+        begun = [episode[name][0] for name in ("gravity", FRICTION, MASS)]
+        begun += [there[0], episode["block.size"][0], episode["reward"][-1]]
+        ends = [summed, mean, most_of, there[-1] - there[0], episode["action"][:-1, 2].sum()]
+        assert next(rows).tolist() == np.concatenate([*map(np.ravel, [*begun, *ends])]).tolist()
+    assert len(refused) == 5
+    for shard in (7, 5):
+        files: Any = {"shard": shard, **circumstances}
+        assert collect(given, design, 24, seed=2, **files) == found
+        parts = [*collect_parts(given, design, 24, seed=2, **files)]
+        assert [len(np.unique(part.episode)) <= shard for part in parts] == [True] * len(parts)
+        whole = Dataset.joined([replace(part, about={}) for part in parts])
+        assert whole == replace(found, about={})
 
 
 def test_instants_have_the_action_of_their_step(world: World) -> None:

@@ -247,10 +247,9 @@ def test_do_order_finds_nothing_false_in_few_episodes(pushing: Problem) -> None:
 # --- tasks: paired experiments --------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("backend", ENGINES)
-def test_paired_experiments_find_nothing_false(backend: str) -> None:
+def test_paired_experiments_find_nothing_false() -> None:
     """A few units show nearly all edges of pushing and no other; without any noise."""
-    made = problem("pushing", view=TaskView(options={"backend": backend}))
+    made = problem("pushing")
     found = learn("paired", made.simulator(0), budget=250)
     assert found.names == made.truth.names
     assert 250 <= found.experiments < 350

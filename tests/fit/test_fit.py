@@ -128,13 +128,13 @@ def test_what_cannot_be_told_apart_is_named_and_an_experiment_determines_it(
     world: sw.World, damped: pd.DataFrame
 ) -> None:
     """Torque, mass, inertia and damping in one proportion move in the same way."""
-    names = ["hinge.damping", "pole.mass", "pole.inertia", "motor.gear"]
-    fit = world.fit(damped, names)
+    names, short = ["hinge.damping", "pole.mass", "pole.inertia", "motor.gear"], damped.iloc[:61]
+    fit = world.fit(short, names)
     assert not fit.identifiable.determined.iloc[-1]
     assert {"pole.mass", "motor.gear"} <= {*fit.confounded[-1]}
     assert "cannot be told apart" in str(fit)
     limits = {"hinge.position": (-2.5, 2.5), "motor.control": (-0.5, 0.5)}
-    (experiment,) = world.fit(damped, names[1:3]).suggest(steps=60, limits=limits)
+    (experiment,) = world.fit(short, names[1:3]).suggest(steps=60, limits=limits)
     assert experiment.after > experiment.before
     assert np.abs(experiment.commands).max() <= 0.5
     assert experiment.frame().shape == (60, 2)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import mujoco
 import numpy as np
 import pytest
 
 import scm_world as sw
+from scm_world.errors import ModelError
 from scm_world.fit import Fit
 
 STEPS, SUBSTEPS = 60, 10
@@ -68,7 +71,8 @@ def test_each_command_has_its_own_delay() -> None:
     run = recorded(2, (14, 33))
     names = ["s.kp", "s.control_delay", "m.control_delay"]
     with sw.World(ARM, control_dt=0.02) as world:
-        fit = world.fit(run, names)
+        fit = world.fit(run, ["s.kp", "*.control_delay"])
+        assert [*fit.values] == names
         assert covers(fit, dict(zip(names, (38.0, 1.4, 3.3), strict=True))) >= 2
         assert [*fit.table.unit[1:]] == ["1", "1"]
         sent = np.stack([run["s.control"], run["m.control"]], axis=1)[:-1]
@@ -76,3 +80,30 @@ def test_each_command_has_its_own_delay() -> None:
         again = fit.world.rollout(sent, seed=0, steps=STEPS - 1, do=past)
         assert again["m.control_delay"][0] == fit.values["m.control_delay"]
         assert np.abs(again["j.position"] - run["j.position"]).max() < 6e-3
+
+
+def decayed(parameters: Any, state: Any, action: Any, noise: Any) -> Any:
+    """Return the warmth of a heated room one control step later."""
+    return {
+        "warmth": state["warmth"] + 0.1 * (action["heat"] - parameters["rate"] * state["warmth"])
+    }
+
+
+def test_the_delay_of_a_step_function_is_a_mean_and_says_so() -> None:
+    """It takes one command in each control step, and no delay can be put before it."""
+    declared: dict[str, Any] = {
+        "parameters": [sw.Exogenous(name="rate", default=0.5, bounds=sw.Box(0.0, 5.0))],
+        "states": [sw.Measured(name="warmth", default=1.0)],
+        "actions": [sw.Action(name="heat", bounds=sw.Box(0.0, 1.0))],
+        "control_dt": 0.1,
+    }
+    heat = np.repeat(np.random.default_rng(0).uniform(size=12), 4)
+    late = 0.7 * np.append(heat[:1], heat[:-1]) + 0.3 * np.append(heat[[0, 0]], heat[:-2])
+    with sw.World(decayed, **declared) as world:
+        episode = world.rollout(late[:, None], seed=0, steps=len(heat))
+        columns = {"time": 0.1 * np.arange(len(heat) + 1), "warmth": episode["warmth"]}
+        fit = world.fit({**columns, "heat": np.append(heat, np.nan)}, ["rate", "heat_delay"])
+        assert fit.values["heat_delay"] == pytest.approx(1.3, abs=1e-6)
+        assert "the mean of two commands" in str(fit)
+        with pytest.raises(ModelError, match="delay them in the step function"):
+            _ = fit.world

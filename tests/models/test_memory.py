@@ -54,11 +54,14 @@ def looks(name: str = "looks", sensor: str = "") -> mujoco.MjSpec:
 
 def held() -> dict[int, int]:
     """Return the sizes of models and of long bytes, by their identities, that anything holds."""
+    gc.unfreeze()  # what there was before the tests may hold something, too
     gc.collect()
     seen = gc.get_referents(*gc.get_objects())
     seen += gc.get_referents(*(d for d in seen if type(d) is dict and not gc.is_tracked(d)))
     models = {id(one): SIZE(one) for one in seen if type(one) is mujoco.MjModel}
-    return models | {id(b): len(b) for b in seen if type(b) is bytes and len(b) > 10_000}
+    found = models | {id(b): len(b) for b in seen if type(b) is bytes and len(b) > 10_000}
+    gc.freeze()
+    return found
 
 
 def height(position: Any) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import pickle
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,14 +14,26 @@ import pytest
 from scm_world.backends.mujoco.batch import MujocoBatch
 from scm_world.discovery.data import Design
 from scm_world.discovery.data.worlds import EpisodeRows
-from scm_world.errors import EngineFailure, OutOfBounds, UnknownVariable
+from scm_world.errors import EngineFailure, OutOfBounds, UnknownOption, UnknownVariable
+from scm_world.graph import SCM
 from scm_world.queries import Outcome, World
 from scm_world.queries import twins as parallel
 from scm_world.queries.episodes import Episode, Unit
 from scm_world.queries.samples import Setting
-from scm_world.queries.together import is_known, run_together
+from scm_world.queries.together import Episodes, is_known, run_together
 from scm_world.queries.twins import Twins, twins_of
-from scm_world.variables import Contact, Hard, Null, Reaches
+from scm_world.variables import (
+    Contact,
+    Draw,
+    Exogenous,
+    Hard,
+    Natural,
+    Normal,
+    Null,
+    Reaches,
+    Scale,
+    Shift,
+)
 
 BULLET = pytest.mark.skipif(
     importlib.util.find_spec("pybullet") is None, reason="Bullet is not installed"
@@ -135,6 +148,88 @@ def test_lives_together_are_those_alone(backend: str, setting: dict[str, Any]) -
     units, twins = units_of(world, plans, **how), twins_of(world)
     for one, other in zip(alone(twins, units), together(twins, units), strict=True):
         assert_same(one, other)
+
+
+DRAWN: tuple[Mapping[str, Any], ...] = (
+    {"floor_friction": Shift(0.05)},
+    {"floor_friction": Shift(0.05, at=4), "tool_block.mass": Draw("B", at=2)},
+    {"gravity": Draw("A"), "joint_damping": Hard(0.05, during=(2, 6))},
+    {"tool_block.mass": Draw("A", every=3)},
+    {"block.size": Draw("A"), "floor_friction": Natural(at=5)},
+    {"tool_block.friction": Hard(0.4, when=FALLS)},
+    {"sensor_noise": 0.1, "tool_block.mass": Hard(5.0, at=6)},
+)
+NATURE = {"floor_friction": "A", "tool_block.mass": Draw("A"), "stage_friction": Scale(1.1)}
+
+
+@pytest.mark.parametrize("n", [1, 5, 21])
+@pytest.mark.parametrize("backend", ["mujoco", "fake"])
+def test_rows_of_one_plan_are_those_alone(backend: str, n: int) -> None:
+    """Draws, acts in mid-episode, refusals and nature, in batches of any size; also as arrays."""
+    world = World("pushing", backend=backend)
+    twins = twins_of(world)
+    made = Setting(steps=9, nature=NATURE, seed=3)
+    of_plan = [made.unit(world, plan, 0, NAMES) for plan in DRAWN]
+    units = [replace(of_plan[i % len(DRAWN)], number=40 - i) for i in range(21)]
+    expected = alone(twins, units)
+    assert sum(isinstance(one, Exception) for one in expected) == 3
+    for first in range(0, len(units), n):
+        some = slice(first, first + n)
+        found = together(twins, units[some])
+        for one, other in zip(expected[some], found, strict=True):
+            assert_same(one, other)
+    names = ("reward", "tool_block.cartesian_position", "floor_friction", "action")
+
+    def read(episodes: Episodes) -> Any:
+        assert len({len(episodes), len(episodes.vectors), len(episodes.units)}) == 1
+        return zip(*(episodes.read(name) for name in names), strict=True)
+
+    rows = twins.run(units, read, catch=OutOfBounds)
+    for one, row in zip(expected, rows, strict=True):
+        if isinstance(one, Episode):
+            assert all(map(same_values, row, (one[name] for name in names)))
+        else:
+            assert str(row) == str(one)
+
+
+def test_rows_that_were_drawn_have_counterfactuals() -> None:
+    """What was drawn in a row is remembered where it is asked for."""
+    world = World("pushing", backend="fake")
+    twins = twins_of(world)
+    plan = {"tool_block.mass": Draw("A"), "gravity": Draw("A", at=2)}
+    units = units_of(world, [plan] * 6, names=("reward",), steps=8)
+    for one, other in zip(alone(twins, units), together(twins, units), strict=True):
+        assert isinstance(one, Episode)
+        assert isinstance(other, Episode)
+        do = {"tool_block.mass": Shift(0.01), "gravity": Natural(at=6)}
+        assert pickle.loads(pickle.dumps(other)) == one  # noqa: S301 # our own
+        branches = [world.rollout("random", episode=one.number, do=plan, steps=8), other]
+        first, second = (branch.counterfactual(do, at=5) for branch in branches)
+        assert first == second
+
+
+def test_worlds_begin_episodes_by_their_numbers() -> None:
+    """Rows and worlds by themselves, with a seed; without one the next episode begins."""
+    one = World("pushing", backend="fake", variables_space="A")
+    do = {"tool_block.mass": Draw("A")}
+    worlds = World("pushing", backend="fake", num_worlds=3)
+    equations = World(SCM([Exogenous(name="x", distribution=Normal())]), num_worlds=3)
+    for _ in range(2):  # rows, then a world by itself among them
+        worlds.reset(seed=[5, 6, 6], episode=[2, 0, 9], do=do)
+        for row, (seed, number) in enumerate([(5, 2), (6, 0), (6, 9)]):
+            one.reset(seed=seed, episode=number, do=do)
+            assert one["tool_block.mass"] == worlds["tool_block.mass"][row]
+        worlds.reset(do=do)
+        one.reset(seed=6, episode=10, do=do)
+        assert one["tool_block.mass"] == worlds["tool_block.mass"][2]
+        worlds.world(2)
+    equations.reset(seed=[4, 4, 4], episode=[0, 1, 7])
+    drawn = equations.one.model.draw(8, seed=4)["x"]
+    assert equations["x"].tolist() == drawn[[0, 1, 7]].tolist()
+    with pytest.raises(UnknownOption, match="a list of 3"):
+        worlds.reset(seed=1, episode=[1, 2])
+    with pytest.raises(UnknownOption, match="any whole number"):
+        equations.reset(seed=1, episode=-1)
 
 
 @pytest.mark.parametrize("threads", [1, 2, 4])

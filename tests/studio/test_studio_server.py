@@ -35,7 +35,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     (folder / "pusher.xml").write_text(PUSHER)
     made = Server("pusher.xml", folder=folder)
     yield made
-    made.stop()
+    assert made.stop() == (0, "")  # no page is open any more
 
 
 def got(url: str, **headers: str) -> tuple[int, str]:
@@ -239,11 +239,9 @@ def test_others_need_the_token(tmp_path: Path) -> None:
 
 
 def test_ctrl_c_ends_it_quietly(tmp_path: Path) -> None:
-    """Nothing is printed, with a page open or none, however often the keys are pressed."""
+    """Nothing is printed with a page open, however often the keys are pressed."""
     (tmp_path / "pusher.xml").write_text(PUSHER)
     server = Server("pusher.xml", folder=tmp_path)
-    assert server.stop() == (0, "")
-    server.start()
     with session(server) as page:
         page.ask("step", n=1)
         assert server.stop(times=3) == (0, "")
@@ -255,20 +253,10 @@ def test_a_taken_port_is_one_line(server: Server, tmp_path: Path) -> None:
         Server("pushing", folder=tmp_path, port=server.port)
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("nothing",), "no task is named 'nothing'"),
-        (("pushing", "--option", "weight=2"), "weight"),
-        (("missing.xml",), "missing.xml"),
-    ],
-)
-def test_a_system_that_does_not_exist_is_one_line(
-    words: tuple[str, ...], said: str, tmp_path: Path
-) -> None:
+def test_a_system_that_does_not_exist_is_one_line(tmp_path: Path) -> None:
     """The command ends before anything is served."""
-    with pytest.raises(AssertionError, match=said):
-        Server(*words, folder=tmp_path)
+    with pytest.raises(AssertionError, match=r"missing\.xml"):
+        Server("missing.xml", folder=tmp_path)
 
 
 def test_a_world_that_cannot_be_built_says_why(tmp_path: Path) -> None:

@@ -44,8 +44,14 @@ FULL = (
     "of the model, for example with <size memory='100M'/>"
 )
 
+OF_DATA = ("xfrc_applied", "mocap_pos", "mocap_quat", "eq_active")
+"""Arrays of the data into which parameters are written; all others are of the model."""
+
 Memory = tuple[Floats, LastStep | None, Floats | None]
 """Forces, what the last step left of turned bodies, and the vector that was written since."""
+
+Usual = tuple[dict[ParameterKey, Floats], mujoco.MjModel, dict[str, NDArray[Any]]]
+"""Parameters, the model with them, and the arrays ``OF_DATA``."""
 
 _ONLY = np.zeros(1, dtype=np.int32)
 """The row of a single vector."""
@@ -88,8 +94,10 @@ class Realization:
     ) -> None:
         self.structure = structure = Model.of(structure, "MuJoCo")
         self._compiled = compiled = reading.compiled(structure)
-        self.model = model = copy.copy(structure.source.whole if whole else compiled)
-        self.data = data = mujoco.MjData(model)
+        source = structure.source.whole if whole else compiled
+        usual = None if whole else self._usual(parameters)
+        self.model = model = copy.copy(source if usual is None else usual[1])
+        self.data = data = mujoco.MjData(source)
         self._slots: dict[ParameterKey, Slot] = {}
         self.kept: dict[ParameterKey, Floats] = {}
         self.revision = object()
@@ -113,8 +121,25 @@ class Realization:
         self._size = int(mujoco.mj_stateSize(model, STATE))
         # MuJoCo prints a warning, and writes it to a file, when it counts the first of its kind.
         self._counts[:] = 1
+        if usual is not None:
+            self.kept |= usual[0]
+            for name, values in usual[2].items():
+                getattr(data, name)[...] = values
+            return
         self.edit(parameters)
         self._slots.clear()  # most are not needed again
+        if not whole and len(parameters) == len(structure.rows):
+            arrays = {name: getattr(data, name).copy() for name in OF_DATA}
+            vars(structure).setdefault("_usual", (dict(self.kept), copy.copy(model), arrays))
+
+    def _usual(self, parameters: Parameters) -> Usual | None:
+        """Return what the first whole scene began with, if it had these parameters."""
+        found: Usual | None = vars(self.structure).get("_usual")
+        if found is None or [*found[0]] != [*parameters]:
+            return None
+        pairs = zip(found[0].values(), parameters.values(), strict=True)
+        same = all(a is b or a.tobytes() == np.asarray(b, np.float64).tobytes() for a, b in pairs)
+        return found if same else None
 
     # --- state ---------------------------------------------------------------------------------
 

@@ -11,6 +11,8 @@ from weakref import ReferenceType, ref
 
 import mujoco
 
+from scm_world.models.model import Model
+
 T = TypeVar("T")
 
 KEPT = 64
@@ -19,7 +21,7 @@ KEPT = 64
 _RECENT: OrderedDict[tuple[int, Any], ReferenceType[Any]] = OrderedDict()
 
 
-def scratch(owner: Any, kind: Any, make: Callable[[], T]) -> T:
+def scratch(owner: object, kind: object, make: Callable[[], T]) -> T:
     """Return what is computed on for a structure, made once for each thread.
 
     Args:
@@ -46,7 +48,7 @@ def kept(function: Callable[[Any], T]) -> Callable[[Any], T]:
     """Return a function of a model whose results end with the source of the model."""
 
     @wraps(function)
-    def found(model: Any) -> T:
+    def found(model: Model) -> T:
         known: dict[Any, T] = vars(model.source).setdefault(f"_{function.__name__}", {})
         if model not in known:
             known[model] = function(model)  # in two threads at once, both find the same
@@ -61,6 +63,6 @@ def silent(data: mujoco.MjData) -> mujoco.MjData:
     return data
 
 
-def forget(owner: Any) -> None:
+def forget(owner: object) -> None:
     """Drop all that a structure has to compute on."""
     vars(owner).pop("_scratch", None)

@@ -75,32 +75,26 @@ class _CompilerMessages:
     def __init__(self, device: str) -> None:
         self._device, self._start, self._count = device, time.monotonic(), 0
 
-    def debug(self, message: str) -> None:
+    def debug(self, message: str, **about: object) -> None:
         """Ignore it."""
 
     warning = error = debug
 
     def info(self, message: str) -> None:
         """Count the modules that were compiled, and not read from the cache."""
-        if not message.endswith("(compiled)"):
-            return
-        if not self._count:
-            where = wp.config.kernel_cache_dir
-            sys.stderr.write(
-                f"mujoco-warp compiles its kernels for {self._device!r}; they are kept in {where}\n"
-            )
-        self._count += 1
-        seconds = time.monotonic() - self._start
-        end = "\r" if sys.stderr.isatty() else "\n"
-        if end == "\r" or self._count % 10 == 1:
-            sys.stderr.write(f"  {self._count} modules of about 40, {seconds:.0f} s{end}")
-            sys.stderr.flush()
+        if message.endswith("(compiled)"):
+            self._count += 1
+            if self._count == 1:
+                where = f"they are kept in {wp.config.kernel_cache_dir}\n"
+                sys.stderr.write(f"mujoco-warp compiles kernels for {self._device!r}; {where}")
+            if self._count % 10 == 1:
+                self.close()
 
     def close(self) -> None:
-        """Say that it is done."""
+        """Say how many there are by now."""
         if self._count:
             seconds = time.monotonic() - self._start
-            sys.stderr.write(f"  {self._count} modules compiled in {seconds:.0f} s\n")
+            sys.stderr.write(f"  {self._count} of about 40 modules in {seconds:.0f} s\n")
 
 
 @contextmanager

@@ -11,7 +11,9 @@ import warp as wp
 
 from scm_world._types import Integers
 from scm_world.backends.mujoco.states import MOST, rotate
+from scm_world.backends.warp.device import FATAL, GROWS
 from scm_world.backends.warp.scenes import Group
+from scm_world.errors import EngineFailure
 from scm_world.geometry.tracing import Expressions, Trace
 from scm_world.models.model import REPORTED
 
@@ -61,18 +63,15 @@ class Resident:
     def _indices(self, numbers: Any) -> torch.Tensor:
         return torch.as_tensor(np.asarray(numbers), dtype=torch.int64, device=self.device)
 
-    def _bind(self) -> Any:
-        """Return the engine, with the parameters of all scenes; find its arrays, if it is new."""
+    def _bind(self) -> None:
+        """Find the arrays of the engine."""
         engine = self._group.synced()
-        if self._data is not engine.data:
-            self._data = engine.data
-            arrays = {name: one.array for name, one in engine.state.items()}
-            self._tensors = {n: wp.to_torch(a).view(len(a), -1) for n, a in arrays.items()}
-        return engine
+        self._data = engine.data
+        arrays = {name: one.array for name, one in engine.state.items()}
+        self._tensors = {n: wp.to_torch(a).view(len(a), -1) for n, a in arrays.items()}
 
     def write(self, slots: Integers) -> None:
         """Copy the states of some scenes from the host to the device."""
-        self._bind()
         where = self._indices(slots)
         for name, values in self._group.numbers(slots).items():
             self._tensors[name][where] = torch.as_tensor(values, device=self.device)
@@ -109,8 +108,13 @@ class Resident:
 
         Returns:
             Why scenes are lost, by number.
+
+        Raises:
+            EngineFailure: Scenes were added meanwhile, and the states are gone.
         """
-        engine, tensors = self._bind(), self._tensors
+        engine, tensors = self._group.synced(), self._tensors
+        if engine.data is not self._data:
+            raise EngineFailure("scenes were added while states stayed on the device", "warp")
         before = {name: tensors[name].clone() for name in self._group.numbers(self._slots[:0])}
         tensors["overflow"].zero_()
         if "ctrl" in tensors:
@@ -119,7 +123,8 @@ class Resident:
         self._wait()
         engine.launch(substeps)
         self._wait()
-        sound = (self._motion().abs() <= MOST).all() & ~tensors["overflow"][self._at].any()
+        full = (tensors["overflow"][self._at] & (GROWS | FATAL)).any()
+        sound = (self._motion().abs() <= MOST).all() & ~full
         self._copies["flags to the host"] += sound.nbytes
         if sound.item():
             return {}
@@ -130,6 +135,7 @@ class Resident:
         self._group.adopt_step(self._slots, every)
         _, reasons = self._group.step(self._slots, given, substeps)
         self._group.adopt_step(self._slots, self._group.numbers(self._slots))
+        self._bind()
         self.write(self._slots)
         return reasons
 

@@ -484,6 +484,7 @@ class WarpScenes(Scenes):
     """
 
     may_refuse: ClassVar[bool] = False
+    stays: ClassVar[bool] = True
     version = mjw.__version__
 
     def __init__(self, n: int, threads: int = 1, device: str = "cpu") -> None:

@@ -1,6 +1,6 @@
 """Data from interventions: tables with regimes, and how to collect them."""
 
-from scm_world.discovery.data.collect import collect
+from scm_world.discovery.data.collect import collect, collect_parts
 from scm_world.discovery.data.croissant import as_huggingface
 from scm_world.discovery.data.dataset import Column, Dataset, Regime
 from scm_world.discovery.data.designs import DESIGNS, Design
@@ -38,6 +38,7 @@ __all__ = [
     "as_tigramite",
     "batches",
     "collect",
+    "collect_parts",
     "default_causes",
     "default_outcomes",
     "from_frame",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from scm_world._arguments import one_of, typed, whole_number
@@ -105,43 +105,75 @@ def collect(
         >>> [table.regimes[i].targets for i in table.regime]
         [(), ('tool_block.mass',), (), ('floor_friction',)]
     """
-    source = as_given(source)
-    count, given = whole_number("n", n, least=1, most=math.inf), dict[str, Any](circumstances)
+    how: Any = {"shard": shard, "progress": progress, "workers": workers, "engine": engine}
+    made, trusted = _rows_of(source, design, seed, circumstances), design.modules
+    return collected(
+        made, whole_number("n", n, least=1, most=math.inf), out, **how, trusted=trusted
+    )
+
+
+@typed
+def collect_parts(
+    source: SCM | CausalSystem,
+    design: Design,
+    n: int,
+    *,
+    seed: int = 0,
+    out: Location | str | None = None,
+    shard: int | None = None,
+    progress: Progress | None = None,
+    workers: int | None = None,
+    engine: Pool | str | None = None,
+    **circumstances: object,
+) -> Iterator[Dataset]:
+    """Collect as ``collect`` does, in bounded memory: yield the rows of each file.
+
+    Files that are there come first, the others as they are ready; the ``about`` of each part has
+    its episodes that were ``"refused"`` and the bodies that were ``"touching"``. Arguments and
+    errors are those of ``collect``.
+    """
+    how: Any = {"shard": shard, "progress": progress, "workers": workers, "engine": engine}
+    made, trusted = _rows_of(source, design, seed, circumstances), design.modules
+    count = whole_number("n", n, least=1, most=math.inf)
+    return (part for _, part in _parts(made, count, out, **how, trusted=trusted))
+
+
+def _rows_of(
+    source: SCM | CausalSystem, design: Design, seed: int, circumstances: Mapping[str, Any]
+) -> EpisodeRows:
+    """Return what makes the rows of a collection, with checked arguments."""
+    source, given = as_given(source), dict(circumstances)
     kind, many = ("model", 1) if isinstance(source, SCM) else ("world", None)
     for name in given:
         one_of(f"circumstance of a {kind}", name, CIRCUMSTANCES[:many])
     if isinstance(source, SCM):
         setting = Setting(None, None, given.get("steps"), seed)
-        made = EpisodeRows(source, design, setting, every_step=True)
-    else:
-        steps = whole_number("steps", given.pop("steps", STEPS), least=1)
-        policy, nature = given.pop("policy", "random"), given.pop("nature", None)
-        made = EpisodeRows(source, design, Setting(policy, nature, steps, seed), **given)
-    return collected(
-        made,
-        count,
-        out=out,
-        shard=shard,
-        progress=progress,
-        workers=workers,
-        engine=engine,
-        trusted=design.modules,
-    )
+        return EpisodeRows(source, design, setting, every_step=True)
+    steps = whole_number("steps", given.pop("steps", STEPS), least=1)
+    policy, nature = given.pop("policy", "random"), given.pop("nature", None)
+    return EpisodeRows(source, design, Setting(policy, nature, steps, seed), **given)
 
 
-def collected(
+def collected(source: EpisodeRows, count: int, out: Location | str | None, **how: Any) -> Dataset:
+    """Read or make the rows of episodes, as one table; see ``collect``."""
+    parts = sorted(_parts(source, count, out, **how), key=lambda part: part[0])
+    settings = settings_of(source.about, source.columns, 1)
+    return together(settings, [part for _, part in parts])
+
+
+def _parts(
     source: EpisodeRows,
     count: int,
-    *,
     out: Location | str | None,
+    *,
     shard: int | None,
     progress: Progress | None,
     workers: int | None,
     engine: Pool | str | None,
     trusted: Sequence[str] = (),
     at_end: bool = False,
-) -> Dataset:
-    """Read or make the rows of episodes; see ``collect``.
+) -> Iterator[tuple[int, Dataset]]:
+    """Yield the rows of each file, with its number.
 
     Functions of the ``trusted`` modules serve as mechanisms. With ``at_end`` the share of refused
     episodes counts only when all are done.
@@ -157,8 +189,8 @@ def collected(
     cells = {shard_name(i): range(at, min(at + size, count)) for i, at in enumerate(starts)}
     seen = {name: f"pictures-{i:05d}.parquet" for i, name in enumerate(cells) if taken}
     settings = settings_of(source.about, source.columns, size)
-    parts = dict[str, Dataset]()
-    refused, done = dict[str, str](), 0
+    places = {name: place for place, name in enumerate(cells)}
+    refused, why, done = 0, ("", ""), 0
     with Study(out, KIND, settings) as study, pool_of(engine, workers) as pool:
         folder = study.folder
         if folder is not None:
@@ -183,16 +215,15 @@ def collected(
             write=lambda made: encoded(made[0]),
             pool=pool,
         ):
-            parts[name] = part
             if pictures and folder is not None:
                 study.keep(seen[name], pictures, cells[name])
             done += len(cells[name])
-            refused |= part.about.get("refused", {})
+            here = [*part.about.get("refused", {}).items()]
+            refused, why = refused + len(here), here[-1] if here else why
             is_known = done == count or (done >= ENOUGH and not at_end)
-            if is_known and 2 * len(refused) > done:
-                number, why = [*refused.items()][-1]
-                said = f"{len(refused)} of {done} episodes were refused; number {number} because"
-                raise InterventionError(f"{said}: {why}", variable="")
+            if is_known and 2 * refused > done:
+                said = f"{refused} of {done} episodes were refused; number {why[0]} because"
+                raise InterventionError(f"{said}: {why[1]}", variable="")
             if progress is not None:
                 progress(done, count)
-    return together(settings, [parts[name] for name in cells])
+            yield places[name], part

@@ -196,10 +196,14 @@ class Dataset:
     ) -> Dataset:
         """Build a table of whole episodes, sorted by their numbers."""
         regimes: dict[Regime, int] = {}
+        known: dict[int, int] = {}  # numbers of regimes by their ids, which are faster to find
         kinds, steps, numbers = list[int](), list[int](), list[int]()
         parts = [np.empty((0, len(columns)))]
         for number, first, other, values in sorted(episodes, key=lambda episode: episode[0]):
-            at = [regimes.setdefault(regime, len(regimes)) for regime in (first, other)]
+            for regime in (first, other):
+                if id(regime) not in known:
+                    known[id(regime)] = regimes.setdefault(regime, len(regimes))
+            at = known[id(first)], known[id(other)]
             kinds += [at[0], *[at[1]] * (len(values) - 1)]
             steps += range(len(values))
             numbers += [number] * len(values)

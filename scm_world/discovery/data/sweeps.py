@@ -329,7 +329,7 @@ def sweep(
     data = collected(
         rows,
         count * len(points),
-        out=out,
+        out,
         shard=shard,
         progress=progress,
         workers=workers,

@@ -310,7 +310,7 @@ class EpisodeRows:
         noise = NoiseOfRows([unit.seed for unit in units], len(units))
         numbers = np.array([unit.number for unit in units], dtype=np.uint64)
         for step in steps:
-            how: Any = {"episode": numbers, "step": step, "count": len(units)}
+            how: dict[str, Any] = {"episode": numbers, "step": step, "count": len(units)}
             drawn = noise.draw(NORMAL, f"{STREAM} {name}", shape, {}, **how)
             scale = strength[noisy, step].reshape(-1, *[1] * len(shape)) * half.reshape(shape)
             values[noisy, step] += scale * drawn

@@ -389,7 +389,7 @@ def coupling(world: Simulation, states: Iterable[str]) -> dict[str, float]:
     if found.max(initial=0.0) <= RESOLUTION:
         return {}
     most = {name: float(found[where].max(initial=0.0)) for name, where in layout.slices.items()}
-    return {name: most.get(name, float(found.max())) for name in states}
+    return {name: most[name] for name in states if name in most}
 
 
 def settable(model: SCM) -> tuple[str, ...]:

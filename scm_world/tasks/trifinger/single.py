@@ -124,7 +124,7 @@ class OneBlock(TriFingerTask):
     ready_terms = kernels.ONE_BLOCK
 
     def __init__(self, tool_block_position: Place, **options: Unpack[BlockOptions]) -> None:
-        common: Any = dict(options)
+        common: dict[str, Any] = {**options}
         self.shape = common.pop("shape", None)
         if not (self.shape is None or isinstance(self.shape, Hull)):
             raise ModelError(

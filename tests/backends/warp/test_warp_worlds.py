@@ -10,9 +10,12 @@ import pytest
 
 pytest.importorskip("mujoco_warp")
 
+from warp._src.logger import get_logger, log_warning
+
 import scm_world as sw
 from scm_world.backends import make_backend, read_model
 from scm_world.backends.warp import WarpBackend
+from scm_world.backends.warp.device import quiet
 from scm_world.errors import EngineFailure, ModelError, UnknownOption
 from scm_world.testing.backend import MODEL
 
@@ -189,3 +192,16 @@ def test_undo_is_exact(worlds: Any) -> None:
             each.step(np.zeros((N, 2)))
     for name, values in plain.values().items():
         assert np.array_equal(worlds[name], values), name
+
+
+def test_a_warning_of_warp_while_it_compiles_stops_nothing(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Warp gives a category and a level of the stack with it; kernels are counted."""
+    with quiet("cpu", compiles=True):
+        log_warning("a kernel is large", category=UserWarning)
+        for _ in range(11):
+            get_logger().info("Module x load on device 'cpu' took 1 ms (compiled)")
+    said = capsys.readouterr().err.splitlines()
+    assert said[0].startswith("mujoco-warp compiles kernels for 'cpu'; they are kept in ")
+    assert [line.split()[0] for line in said[1:]] == ["1", "11", "11"]
