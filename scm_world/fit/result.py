@@ -45,6 +45,7 @@ from scm_world.fit.targets import (
     Target,
     delays_of,
     free_states,
+    posterior_of,
     ranges_of,
     twin_of,
     values_of,
@@ -53,7 +54,7 @@ from scm_world.geometry.rotations import aligned
 from scm_world.queries.world import World
 from scm_world.runs.canvas import PALETTE, blank, styled
 from scm_world.tasks.model import ModelTask
-from scm_world.variables.interventions import has_times
+from scm_world.variables.interventions import Mechanism, has_times
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -452,6 +453,20 @@ class Fit:
             how = Reading(None, columns, ignore)
             return predicted(self, read_recording(twin, recording, how), ahead)
 
+    @property
+    def spread(self) -> Floats:
+        """Covariance of the scaled parameters, with a wide prior where nothing is known, (p, p)."""
+        return spread_of(self.sensitivities / np.sqrt(self.discount))
+
+    def posterior(self) -> dict[str, Mechanism]:
+        """Return what the recording leaves open as an intervention that draws the parameters.
+
+        They are drawn together, from the normal distribution of the scaled parameters that
+        ``counterfactual`` uses, within their ranges: ``start=fit.posterior()`` of an environment
+        randomises by what was not determined. A delay is not among them.
+        """
+        return posterior_of(self.targets, self.scaled, self.spread)
+
     def save(self, path: str | Path) -> None:
         """Write the fit to a file, as its ending says.
 
@@ -666,10 +681,8 @@ class Fit:
         if has_times(do):
             raise UnknownOption("do", do, ("interventions without a time: at= says when",))
         rng = np.random.default_rng(whole_number("seed", seed, least=0))
-        along = self.sensitivities / np.sqrt(self.discount)
-        spread = spread_of(along)
         away = rng.multivariate_normal(
-            np.zeros(len(self.scaled)), spread, whole_number("draws", draws, least=2)
+            np.zeros(len(self.scaled)), self.spread, whole_number("draws", draws, least=2)
         )
         size = np.sqrt(self.degrees / rng.chisquare(self.degrees, (draws, 1)))  # Student's t
         away = self.scaled + size * away

@@ -17,6 +17,8 @@ from scm_world.fit.recordings import MeasuredNumber, labels, settable_of
 from scm_world.queries.twins import twins_of
 from scm_world.queries.world import World
 from scm_world.variables import Box
+from scm_world.variables.distributions import Normal
+from scm_world.variables.interventions import Mechanism
 from scm_world.world import Simulation
 
 DELAY = "delay"  # name of the delay of all commands [s], which is fitted like a parameter
@@ -64,6 +66,75 @@ class Target:
         if self.log:
             return np.asarray(self.default * np.exp(scaled))
         return np.asarray(self.default + self.scale * np.asarray(scaled))
+
+    def scaled(self, value: ArrayLike) -> Floats:
+        """Return the scaled number of a value, or those of an array of them."""
+        if self.log:
+            return np.log(np.asarray(value) / self.default)
+        return (np.asarray(value) - self.default) / self.scale
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Conditional:
+    """Draws a fitted parameter from the posterior, given the parameters that were drawn before it.
+
+    Attributes:
+        own: Its fitted numbers.
+        before: Those of its parents, in their order, and which parent has each.
+        middle: Scaled values of its own numbers where those before it have theirs, shape (p,).
+        others: Scaled values of those before it, shape (q,).
+        slope: Derivatives by those before it, shape (p, q).
+        root: Cholesky factor of the covariance that is left, shape (p, p).
+    """
+
+    own: tuple[Target, ...]
+    before: tuple[tuple[int, Target], ...]
+    middle: Floats
+    others: Floats
+    slope: Floats
+    root: Floats
+
+    def __call__(self, *parents: Floats, noise: Floats) -> Floats:
+        """Return values of the parameter, with leading axes of the worlds, as the noise has."""
+        usual = np.asarray(self.own[0].values)
+        lead = np.shape(noise)[: np.ndim(noise) - usual.ndim]
+        values = np.broadcast_to(usual, (*lead, *usual.shape)).copy().reshape(*lead, -1)
+        drawn = np.reshape(noise, (*lead, -1))[..., : len(self.own)] @ self.root.T + self.middle
+        for i, (place, target) in enumerate(self.before):
+            there = np.reshape(parents[place], (*lead, -1))[..., target.component]
+            drawn = drawn + (target.scaled(there) - self.others[i])[..., None] * self.slope[:, i]
+        for i, target in enumerate(self.own):
+            value = target.value(np.clip(drawn[..., i], target.low, target.high))
+            if target.whole:
+                values = values * (value / values[..., target.component])[..., None]
+            else:
+                values[..., target.component] = value
+        return np.asarray(values.reshape((*lead, *usual.shape)))
+
+
+def posterior_of(targets: Sequence[Target], scaled: Floats, spread: Floats) -> dict[str, Mechanism]:
+    """Return the joint normal distribution of scaled numbers as mechanisms of their parameters.
+
+    Args:
+        targets: The numbers; delays are not among the mechanisms.
+        scaled: Their scaled means, shape (p,).
+        spread: Their covariance, shape (p, p).
+    """
+    found, before = dict[str, Mechanism](), list[int]()
+    for name in dict.fromkeys(t.variable for t in targets if t.values is not None):
+        own = [i for i, target in enumerate(targets) if target.variable == name]
+        slope = np.linalg.solve(spread[np.ix_(before, before)], spread[np.ix_(before, own)]).T
+        left = spread[np.ix_(own, own)] - slope @ spread[np.ix_(before, own)]
+        root = np.linalg.cholesky(left + 1e-12 * np.diag(np.diag(left)))
+        parents = [*found]
+        pairs = tuple((parents.index(targets[i].variable), targets[i]) for i in before)
+        mine = tuple(targets[i] for i in own)
+        middles = scaled[own], scaled[before]
+        drawn = Conditional(mine, pairs, *middles, np.asarray(slope), np.asarray(root))
+        found[name] = Mechanism(drawn, parents, noise=Normal())
+        before += own
+    return found
 
 
 def begin(twin: Simulation, world: World) -> None:

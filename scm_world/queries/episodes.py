@@ -62,6 +62,7 @@ class Unit:
     start: Snapshot | None = (
         None  # snapshot at that instant, before interventions; None for a new episode
     )
+    ends: bool = False  # whether the names are recorded at the first and last instants only
     listens: bool = False  # whether to record contacts in every physics step, which is slower
 
     def run(self, world: CausalSystem, twins: Twins | None = None) -> Episode:
@@ -245,7 +246,7 @@ class Episode:
             statics = {name: np.array(now[name]) for name in world.static_names}
             self.eras.append(Era(step, world.compiled, statics))
         self.vectors.append(world.vector.copy())
-        if names:
+        if names and not (self.unit.ends and 0 < step < self.unit.steps):
             there = tuple(name for name in names if name in world.model)
             found = world.row if ready else world.evaluate(None if names == (ALL,) else there)
             for name in world.model if names == (ALL,) else there:

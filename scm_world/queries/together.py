@@ -68,7 +68,10 @@ class Episodes(Sequence[Episode]):
         return self._by_episode(self._many.vectors)
 
     def read(self, name: str) -> Value:
-        """Return a variable at every instant, shape (n, steps + 1, *shape); see ``Episode``."""
+        """Return a variable at every instant, shape (n, steps + 1, *shape); see ``Episode``.
+
+        Of units that record only the ends, these are the two instants of a recorded variable.
+        """
         return self._by_episode(self._many[name])
 
     def _by_episode(self, found: Any) -> Value:
@@ -129,6 +132,7 @@ class _Together:
     def __init__(self, batch: Batch, units: Sequence[Unit], twins: Any) -> None:
         self._batch, self._twins = batch, twins
         self._first, self._steps = units[0].first, units[0].steps
+        self._names, self._ends = units[0].names, units[0].ends
         first, n = batch.first, len(batch)
         self._errors: dict[int, Exception] = {}  # by row
         self._commands = np.zeros((self._steps, n, first.compiled.n_actions))
@@ -223,8 +227,8 @@ class _Together:
         if self._shared:
             table, many, n = self._table(), self._many, len(self._units)
             many.vectors[step] = table.numbers[:n, : table.compiled.state_size]
-            model = table.compiled.model
-            self._write(step, [name for name in self._units[0].names if name in model])
+            if not (self._ends and 0 < step < self._steps):
+                self._write(step, [name for name in self._names if name in table.compiled.model])
         for row, (_, one) in self._rows.items():
             if self._pending[row]:
                 one._note(step, ready=True)
@@ -232,15 +236,18 @@ class _Together:
     def _write(self, step: int, names: Iterable[str]) -> None:
         """Write the present values of variables into the record of the rows that act together."""
         table, n = self._table(), len(self._units)
+        instants, at = (2, min(step, 1)) if self._ends else (self._steps + 1, step)
         for name in names:
             now = table[name][:n]
             there = self._many.values.get(name)
             if there is None:
-                there = np.empty((self._steps + 1, *now.shape), now.dtype)
+                there = np.empty((instants, *now.shape), now.dtype)
                 self._many.values[name] = there
-            there[step] = now
+            there[at] = now
 
     def _act(self, step: int) -> None:
+        if self._ends:  # nothing is computed for the instants between
+            self._batch.names = self._names if step == self._steps - 1 else ()
         if self._goes_on.any():
             self._batch.advance(self._commands[step], self._goes_on)
         if self._shared:

@@ -178,10 +178,10 @@ class Planned(CausalSystem):
             raise
 
     def _follow(self, schedule: _Schedule) -> None:
-        self._schedule = schedule
+        self._schedule, self.plan_end = schedule, 0.0
         self.is_planned = any(parts for _, parts in schedule.plan.layers())
-        timed = schedule.plan.timed() if self.is_planned else ()
-        self.plan_end = max((act.time.last for _, act in timed), default=0.0)
+        if self.is_planned:
+            self.plan_end = max((act.time.last for _, act in schedule.plan.timed()), default=0.0)
 
     def _may_act(self, step: int) -> bool:
         """Return whether the plan of the episode may still intervene at a control step."""

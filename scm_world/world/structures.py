@@ -89,7 +89,7 @@ class StructureCache:
 
     def plan(self, values: Values) -> Plan:
         """Return the structure that follows from values of the head."""
-        return self.task.arrange(values) if len(self.head) else None, frozenset()
+        return self.task.arrange(values) if self.deciding else None, frozenset()
 
     def _compile(self, plan: Plan) -> CompiledTask:
         task = self.task.at(plan[0], self.options.conventions, plan[1])
@@ -100,7 +100,7 @@ class StructureCache:
 
     def natural(self, key: NoiseKey | None) -> CompiledTask:
         """Return the structure of an episode without interventions."""
-        values = self.head.solve(key=key) if len(self.head) else {}
+        values = self.head.solve(key=key) if self.deciding else {}
         return self.compiled(self.plan(values))
 
     def after(

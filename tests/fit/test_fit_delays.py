@@ -31,18 +31,22 @@ ARM = """
 """
 
 
-def recorded(seed: int, delays: tuple[float, float]) -> dict[str, np.ndarray]:
-    """Record MuJoCo with another gain and with delays in physics steps, by hand."""
+def recorded(seed: int, delays: tuple[int, int], shift: int = 0) -> dict[str, np.ndarray]:
+    """Record MuJoCo with another gain and with delays in physics steps, by hand.
+
+    ``shift`` is the delay of the sensor.
+    """
     rng, model = np.random.default_rng(seed), mujoco.MjModel.from_xml_string(ARM)
     model.actuator_gainprm[0, 0], model.actuator_biasprm[0, 1] = 38.0, -38.0
-    data, seen = mujoco.MjData(model), []
+    data, seen, places = mujoco.MjData(model), [], [0.0]
     sent = np.repeat(rng.uniform([-1, -2], [1, 2], (10, 2)), STEPS // 10, axis=0)
     for step in range(STEPS):
-        seen.append(data.qpos[0] + 1e-3 * rng.normal())
+        seen.append(places[max(0, SUBSTEPS * step - shift)] + 1e-3 * rng.normal())
         for i in range(SUBSTEPS):
             late = [(SUBSTEPS * step + i - delay) // SUBSTEPS for delay in delays]
             data.ctrl[:] = [sent[max(0, int(at)), which] for which, at in enumerate(late)]
             mujoco.mj_step(model, data)
+            places.append(data.qpos[0])
     columns = {"s.control": sent[:, 0], "m.control": sent[:, 1], "j.position": np.array(seen)}
     return {"time": 0.02 * np.arange(STEPS), **columns}
 
@@ -107,3 +111,28 @@ def test_the_delay_of_a_step_function_is_a_mean_and_says_so() -> None:
         assert "the mean of two commands" in str(fit)
         with pytest.raises(ModelError, match="delay them in the step function"):
             _ = fit.world
+
+
+def read(position: float, gain: float, offset: float) -> float:
+    """Return what an encoder reads."""
+    return gain * position + offset
+
+
+def test_sensors_are_fitted_by_name() -> None:
+    """Gain and offset of an encoder, and the delay of another sensor, are ordinary parameters."""
+    gain = sw.Exogenous(name="encoder.gain", default=1.0, bounds=sw.Box(0.1, 10.0))
+    offset = sw.Exogenous(name="encoder.offset", default=0.0, unit="rad")
+    parents = ("j.position", gain.name, offset.name)
+    encoder = sw.Measured(name="encoder", unit="rad", parents=parents, mechanism=read)
+    sensed: dict[str, Any] = {"ties": [gain, offset], "outcomes": [encoder]}
+    run, names = recorded(4, (0, 0)), ["s.kp", "encoder.gain", "encoder.offset"]
+    run["encoder"] = read(run.pop("j.position"), 1.1, 0.2)
+    with sw.World(ARM, control_dt=0.02, **sensed) as world:
+        found = covers(world.fit(run, names), dict(zip(names, (38.0, 1.1, 0.2), strict=True)))
+    run = recorded(4, (0, 0), shift=14)
+    run["j.position_reading"] = run.pop("j.position")
+    with sw.World(ARM, control_dt=0.02, delay={"j.position": sw.Box(0.0, 3.0)}) as world:
+        early = world.given({"j.position_delay": 0.5})
+        fit = early.fit(run, ["s.kp", "j.position_delay"])
+        found += covers(fit, {"s.kp": 38.0, "j.position_delay": 1.4})
+    assert found >= 4

@@ -122,3 +122,38 @@ def test_a_urdf_is_written_by_the_command(tmp_path: Path, monkeypatch: Any) -> N
     fitted.reset(seed=0)
     assert float(fitted["hinge.damping"]) == pytest.approx(0.03, rel=1e-3)
     assert float(fitted["pole.mass"]) == pytest.approx(0.3, rel=1e-3)
+
+
+def test_an_environment_starts_with_what_the_recording_leaves_open() -> None:
+    """Draws have the mean and the covariance of the fit: a ridge of mass and gear stays one."""
+    world = sw.World(MODEL)
+    names = ["weight.mass", "motor.gear", "hinge.damping", "gravity[2]"]
+    recording = recorded(world, {"hinge.damping": 0.02})
+    fit = world.fit(recording, names, noise=1e-2)
+    start = fit.posterior()
+    assert [*start] == ["weight.mass", "motor.gear", "hinge.damping", "gravity"]
+    drawn = []
+    for seed in range(400):
+        world.reset(seed=seed, do=start)
+        values = [float(np.ravel(world[t.variable])[t.component]) for t in fit.targets]
+        drawn.append([float(t.scaled(v)) for t, v in zip(fit.targets, values, strict=True)])
+    assert float(world["gravity"][0]) == 0.0
+    worlds = sw.World(MODEL, num_worlds=3)
+    worlds.reset(seed=5, do=start)
+    assert len({*np.ravel(worlds.values()["motor.gear"]).tolist()}) == 3
+    errors = np.sqrt(np.diag(fit.spread))
+    away = (np.array(drawn) - fit.scaled) / errors
+    np.testing.assert_allclose(away.mean(axis=0), 0.0, atol=4 / 400**0.5)
+    wanted = fit.spread / np.outer(errors, errors)
+    np.testing.assert_allclose(np.cov(away.T), wanted, atol=6 / 400**0.5)
+    assert np.abs(wanted - np.eye(4)).max() > 0.8
+    import gymnasium
+
+    env = gymnasium.make("scm_world/Model-v0", model=MODEL, start=start, reward="hinge.position")
+    inner: Any = env.unwrapped
+    gears = []
+    for seed in (3, 4):
+        env.reset(seed=seed)
+        gears.append(float(inner.world["motor.gear"]))
+    assert len({*gears, 1.0}) == 3
+    env.close()

@@ -238,6 +238,9 @@ class EpisodeRows:
 
         written = {*self._watched} - {*world.compiled.slices, *world.static_names}
         names = tuple(name for name in self._watched if name in written)
+        whole = self._every_step or not {o.how for o in self._read} <= {"final", "first", "change"}
+        ends = not (self._pure or whole) and world.compiled.decided.isdisjoint(names)
+        how: Any = {"ends": ends, "listens": self._contacts}
         cases = [*self._design.cases(seed, numbers)]
         kinds: dict[int, tuple[Unit, list[Regime]]] = {}
         for *_, regime in cases:
@@ -245,7 +248,7 @@ class EpisodeRows:
                 unit = self._unit(regime, 0, names)
                 rows = [replace(regime, targets=self._targets(regime.targets, t)) for t in (0, 1)]
                 steps = unit.steps + self._further
-                kinds[id(regime)] = replace(unit, steps=steps, listens=self._contacts), rows
+                kinds[id(regime)] = replace(unit, **how, steps=steps), rows
         units = [replace(kinds[id(regime)][0], number=number) for _, number, regime in cases]
         found = self._twins.run(units, finish, self._setting.workers, InterventionError)
         for (number, _, regime), result in zip(cases, found, strict=True):
@@ -313,7 +316,8 @@ class EpisodeRows:
             how: dict[str, Any] = {"episode": numbers, "step": step, "count": len(units)}
             drawn = noise.draw(NORMAL, f"{STREAM} {name}", shape, {}, **how)
             scale = strength[noisy, step].reshape(-1, *[1] * len(shape)) * half.reshape(shape)
-            values[noisy, step] += scale * drawn
+            instants = values.shape[1]  # two, if only the ends were recorded
+            values[noisy, step if instants > episodes.steps else min(step, 1)] += scale * drawn
         return values
 
 
