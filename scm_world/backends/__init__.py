@@ -115,7 +115,7 @@ def make_backend(name: str) -> Backend:
     class_name, requirement = _CLASSES[name]
     try:
         module = importlib.import_module(f"scm_world.backends.{name}")
-        found: Any = getattr(module, class_name)
+        found = getattr(module, class_name)
     except MissingEngine:
         raise
     except ImportError as error:

@@ -197,7 +197,7 @@ class Observer:
         """Return the reward, whether the episode ends, and the info: of several worlds columns."""
         numbers = now.numbers
         info: dict[str, Any] = {}
-        take: Any = numbers.item if numbers.ndim == 1 else numbers.T.__getitem__
+        take: Callable[[Any], Any] = numbers.item if numbers.ndim == 1 else numbers.T.__getitem__
         reward, ended, success, fraction = self.outcomes
         if success is not None:
             info["is_success"] = info["success"] = take(success) != 0.0

@@ -102,7 +102,7 @@ class ManyPpo:
         first = self._seen(np.zeros((n, *space.shape), np.float32))
         groups = {name: [SEEN] for name in ("actor", "critic")}
         network = recipe.network
-        shape: Any = {"hidden_dims": [*network.hidden], "activation": network.activation}
+        shape: dict[str, Any] = {"hidden_dims": [*network.hidden], "activation": network.activation}
         normal = {
             "class_name": "GaussianDistribution",
             "init_std": float(np.exp(network.log_std)),

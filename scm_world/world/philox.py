@@ -13,7 +13,7 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world._types import Floats
+from scm_world._types import Floats, Integers
 from scm_world.geometry.numbers import njit
 from scm_world.variables import Noise
 from scm_world.variables.distributions import word_of
@@ -128,7 +128,7 @@ class NoiseOfRows(Noise):
         vars(self).update(seed=seed, where=where, at=None)
 
     def uniforms(
-        self, variable: str, *, n: int, episode: Any = 0, step: int = 0, count: int = 1
+        self, variable: str, *, n: int, episode: int | Integers = 0, step: int = 0, count: int = 1
     ) -> Floats:
         """Draw the uniform numbers of a variable, shape ``(count, n)``; ``episode`` has as many."""
         found, kept = np.empty((count, 1, n)), vars(self)

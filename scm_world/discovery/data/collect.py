@@ -105,7 +105,12 @@ def collect(
         >>> [table.regimes[i].targets for i in table.regime]
         [(), ('tool_block.mass',), (), ('floor_friction',)]
     """
-    how: Any = {"shard": shard, "progress": progress, "workers": workers, "engine": engine}
+    how: dict[str, Any] = {
+        "shard": shard,
+        "progress": progress,
+        "workers": workers,
+        "engine": engine,
+    }
     made, trusted = _rows_of(source, design, seed, circumstances), design.modules
     return collected(
         made, whole_number("n", n, least=1, most=math.inf), out, **how, trusted=trusted
@@ -132,7 +137,12 @@ def collect_parts(
     its episodes that were ``"refused"`` and the bodies that were ``"touching"``. Arguments and
     errors are those of ``collect``.
     """
-    how: Any = {"shard": shard, "progress": progress, "workers": workers, "engine": engine}
+    how: dict[str, Any] = {
+        "shard": shard,
+        "progress": progress,
+        "workers": workers,
+        "engine": engine,
+    }
     made, trusted = _rows_of(source, design, seed, circumstances), design.modules
     count = whole_number("n", n, least=1, most=math.inf)
     return (part for _, part in _parts(made, count, out, **how, trusted=trusted))
