@@ -400,8 +400,8 @@ class Fit:
         """Runs that are played from their first row, without measurements on the way.
 
         A row for each measured column, with its ``unit`` and the root mean square of measured
-        minus played, by the ``fit``, by the ``unfitted`` world from the same start, and by a
-        ``constant``, the mean of the column.
+        minus played, by the ``fit``, by the ``unfitted`` world, and by a ``constant``, the mean of
+        the column. Each begins with the start state with which it fits the first window best.
         """
         import pandas as pd
 
