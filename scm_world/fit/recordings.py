@@ -102,6 +102,8 @@ class RecordedRun:
         begin: Time of its first row [s].
         whole: Whether it begins with the recording, and not after a gap.
         do: Its set-up: values of parameters that were set for it, by columns.
+        before: Commands of the control steps before its first row, if they are known, shape
+            (steps, n_actions), of which a delay has the last ones.
     """
 
     commands: Floats
@@ -110,6 +112,7 @@ class RecordedRun:
     begin: float = 0.0
     whole: bool = True
     do: Mapping[str, float] = field(default_factory=dict)
+    before: Floats | None = None
 
     @cached_property
     def filled(self) -> Floats:
@@ -121,12 +124,22 @@ class RecordedRun:
                 column[:] = np.interp(self.instants, self.instants[seen], column[seen])
         return found
 
+    def late(self, steps: Integers) -> Floats:
+        """Return the commands of control steps, also of those before the first row (n, n_actions).
+
+        Where it is not known, the first command is assumed to hold before.
+        """
+        before = self.commands[:0] if self.before is None else self.before
+        sent = np.concatenate([before, self.commands])
+        return sent[np.clip(steps + len(before), 0, len(sent) - 1)]
+
     def part(self, first: int, last: int, control_dt: float) -> RecordedRun:
         """Return the run from a row to that before another one, with the length of a step [s]."""
         since, instants = int(self.instants[first]), self.instants[first:last]
         sent = self.commands[since : int(instants[-1])]
         begin, whole = self.begin + control_dt * since, self.whole and not first
-        rest = self.values[first:last], begin, whole, self.do
+        before = self.late(np.arange(since))
+        rest = self.values[first:last], begin, whole, self.do, before
         return RecordedRun(sent, instants - since, *rest)
 
 
@@ -309,7 +322,7 @@ def read_recording(
     setups = [{}] * len(every) if how.setups is None else how.setups
     if len(setups) != len(every):
         raise UnknownOption("setups", f"{len(setups)} set-ups", (f"{len(every)}, one of each",))
-    for number, (one, setup) in enumerate(zip(every, setups, strict=True), 1):
+    for number, (one, setup) in enumerate(zip(every, setups, strict=True)):
         label = f"run {number}" if one is not recording else ""
         label, table = (str(one), _file(one)) if isinstance(one, str | Path) else (label, one)
         if isinstance(table, Mapping | pd.DataFrame):
@@ -421,7 +434,7 @@ def _frames(
 
     dt = world.options.control_period
     if isinstance(given, list | tuple):
-        for number, one in enumerate(given, 1):
+        for number, one in enumerate(given):
             yield from _frames(world, one, f"run {number}")
     elif isinstance(given, str | Path):
         yield from _frames(world, _file(given), str(given))

@@ -14,7 +14,7 @@ import numpy as np
 from scm_world._arguments import load
 from scm_world._types import Floats
 from scm_world.errors import ModelError, ScmWorldError, UnknownOption
-from scm_world.fit.targets import twin_of, values_of
+from scm_world.fit.targets import LATE, twin_of, values_of
 from scm_world.runs.canvas import png
 from scm_world.runs.files import write_whole
 from scm_world.tasks.model import ModelTask
@@ -80,9 +80,10 @@ def _save_model(fit: Fit, path: Path) -> None:
     before = str(source) if whole else Path(source).read_text("utf-8")
     after, trial = before, path.with_name(f"trial-{path.name}")
     with twin_of(fit.asked) as twin:
-        names = twin.compiled.static_names
+        names = [n for n in twin.compiled.static_names if not n.endswith(LATE)]
         given = {n: np.array(twin[n]) for n in fit.asked.plan.at_start() if n in names}
-        values = given | values_of(fit.targets, fit.scaled)
+        fitted = values_of(fit.targets, fit.scaled)
+        values = given | {n: value for n, value in fitted.items() if not n.endswith(LATE)}
         wanted = {name: np.array(values.get(name, twin[name])) for name in names}
         system: Any = twin.composition.system
         mj = system.source.realized

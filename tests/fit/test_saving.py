@@ -90,7 +90,7 @@ def test_the_own_file_has_the_fitted_numbers_and_its_comments(tmp_path: Path) ->
 
 
 def test_given_values_are_written_with_the_fitted_ones(tmp_path: Path) -> None:
-    """The mass that was given is part of the fit, and a sensor may be named like the motor."""
+    """The mass that was given is written, a delay is not; a sensor is named like the motor."""
     text = MODEL.replace(
         "<worldbody>", "<sensor><jointpos name='motor' joint='hinge'/></sensor><worldbody>"
     )
@@ -99,6 +99,12 @@ def test_given_values_are_written_with_the_fitted_ones(tmp_path: Path) -> None:
     fit.save(tmp_path / "arm.xml")
     plain = mujoco.MjModel.from_xml_path(str(tmp_path / "arm.xml"))
     assert plain.body("pole").mass[0] == 0.4
+    assert plain.actuator_gear[0, 0] == fit.values["motor.gear"]
+    late = sw.World(MODEL, delay={"motor.control": sw.Box(0.0, 3.0)})
+    names = ["motor.gear", "motor.control_delay"]
+    fit = late.fit(recorded(late, {"motor.control_delay": 1.4, "motor.gear": 1.3}), names)
+    fit.save(tmp_path / "late.xml")
+    plain = mujoco.MjModel.from_xml_path(str(tmp_path / "late.xml"))
     assert plain.actuator_gear[0, 0] == fit.values["motor.gear"]
     narrow = sw.World(MODEL, expose=["pole.inertia"])
     fit = narrow.fit(recorded(narrow, {}), ["pole.inertia"], noise=1e-3)
