@@ -16,6 +16,7 @@ import math
 import operator
 from collections.abc import Callable, Iterable
 from functools import cache, partial
+from itertools import combinations
 from types import FunctionType, SimpleNamespace
 from typing import Any, final
 
@@ -130,7 +131,9 @@ class Trace:
 
     def inner(self, function: Any, arguments: list[Any]) -> Any:
         """Call a function within the one that is traced: its decisions are joined at its end."""
-        before = self.answers
+        before, arrays = self.answers, [one for one in arguments if isinstance(one, np.ndarray)]
+        if any(np.may_share_memory(*pair) for pair in combinations(arrays, 2)):
+            raise Untraceable("two of its arguments are parts of one array")  # copied below
         found, *written = self._explored(function, arguments, before)
         self.answers = before
         for array, after in zip(arguments, written, strict=True):

@@ -79,6 +79,17 @@ def _marked(array: Any, number: float) -> None:
         array[0] = 1.0
 
 
+@njit(cache=True)
+def _both(one: Any, other: Any) -> None:
+    one[0] = 3.0
+    other[0] += one[0]
+
+
+def _twice(point: Any, _: float) -> Any:
+    _both(point, point)
+    return point[0]
+
+
 def _columns(function: Any, size: int) -> tuple[Any, Any]:
     trace = Trace()
     point = np.array([trace.column(0), trace.column(1)])
@@ -111,6 +122,7 @@ def test_columns_have_the_numbers_of_the_compiled_function(function: Any, size: 
         (lambda point, _: np.array([0.0]).__setitem__(0, point[0]), "float"),
         (lambda point, _: point[0] ** 3, "power"),
         (lambda point, _: _marked(np.array([0.0]), point[0]), "float"),
+        (_twice, "parts of one array"),
     ],
 )
 def test_what_symbols_cannot_say_is_refused(source: Any, why: str) -> None:
