@@ -50,6 +50,7 @@ from scm_world.fit.targets import (
     twin_of,
     values_of,
 )
+from scm_world.fit.units import check_units
 from scm_world.geometry.rotations import aligned
 from scm_world.queries.world import World
 from scm_world.runs.canvas import PALETTE, blank, styled
@@ -447,11 +448,13 @@ class Fit:
 
         Raises:
             UnknownOption: No window has a row to predict.
-            ModelError: The recording has faults.
+            ModelError: The recording has faults, or is in degrees.
         """
         with twin_of(self.asked) as twin:
             how = Reading(None, columns, ignore)
-            return predicted(self, read_recording(twin, recording, how), ahead)
+            measured = read_recording(twin, recording, how)
+        check_units(self.asked, measured)
+        return predicted(self, measured, ahead)
 
     @property
     def spread(self) -> Floats:

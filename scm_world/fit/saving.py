@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import re
+import uuid
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -78,7 +79,7 @@ def _save_model(fit: Fit, path: Path) -> None:
         raise ModelError(["the world was not made from a model file: save values as .yaml"])
     whole = str(source).lstrip().startswith("<")
     before = str(source) if whole else Path(source).read_text("utf-8")
-    after, trial = before, path.with_name(f"trial-{path.name}")
+    after, trial = before, path.with_name(f"{uuid.uuid4().hex}{path.suffix}")
     with twin_of(fit.asked) as twin:
         names = [n for n in twin.compiled.static_names if not n.endswith(LATE)]
         given = {n: np.array(twin[n]) for n in fit.asked.plan.at_start() if n in names}

@@ -106,9 +106,11 @@ def test_given_values_are_written_with_the_fitted_ones(tmp_path: Path) -> None:
     fit.save(tmp_path / "late.xml")
     plain = mujoco.MjModel.from_xml_path(str(tmp_path / "late.xml"))
     assert plain.actuator_gear[0, 0] == fit.values["motor.gear"]
+    (tmp_path / "trial-narrow.xml").write_text("of the user")
     narrow = sw.World(MODEL, expose=["pole.inertia"])
     fit = narrow.fit(recorded(narrow, {}), ["pole.inertia"], noise=1e-3)
     fit.save(tmp_path / "narrow.xml")
+    assert (tmp_path / "trial-narrow.xml").read_text() == "of the user"
     plain = mujoco.MjModel.from_xml_path(str(tmp_path / "narrow.xml"))
     assert plain.body("pole").mass[0] == 0.2
 

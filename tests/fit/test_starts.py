@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 import scm_world as sw
 from scm_world._types import Floats
-from scm_world.errors import UnknownOption, UnknownVariable
+from scm_world.errors import ModelError, UnknownOption, UnknownVariable
 
 SERVO = """
 <mujoco model="servo"><option gravity="0 0 0"/>
@@ -151,6 +151,9 @@ def test_a_right_fit_replays_with_the_noise() -> None:
     assert fit.replay.unfitted[0] > 0.01
     assert fit.table.determined.all()
     assert "from the first row, the unfitted" not in str(fit)
+    turned = {**recording, "hinge.position": np.rad2deg(recording["hinge.position"])}
+    with pytest.raises(ModelError, match="are in degrees"):
+        fit.predict(turned)
 
 
 def test_what_was_held_out_is_predicted() -> None:
