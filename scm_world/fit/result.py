@@ -470,6 +470,7 @@ class Fit:
         """
         return posterior_of(self.targets, self.scaled, self.spread)
 
+    @typed
     def save(self, path: str | Path) -> None:
         """Write the fit to a file, as its ending says.
 
