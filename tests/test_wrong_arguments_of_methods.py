@@ -289,7 +289,7 @@ def of_questions(_: Path) -> Iterator[Case]:
     )
 
 
-def of_fits(_: Path) -> Iterator[Case]:
+def of_fits(folder: Path) -> Iterator[Case]:
     """Yield what a recording is asked for, and the methods of a fit."""
     world = grown()
     recorded = world.rollout("random", steps=12)
@@ -302,7 +302,8 @@ def of_fits(_: Path) -> Iterator[Case]:
     fit, once = world.fit(recorded, ["rate"]), {"at": 0, "run": 0, "draws": 2, "seed": 0}
     yield from of(fit, counterfactual={"do": {"rate": 0.5}, **once}, picture={"run": 0})
     yield from of(fit, suggest={"n": 1, "steps": 3, "limits": None, "seed": 0})
-    yield from of(fit, deviates={"name": "rate"})
+    yield from of(fit, deviates={"name": "rate"}, save={"path": str(folder / "fit.yaml")})
+    yield from of(fit, predict={"recording": recorded, "ahead": 0.2})
 
 
 def of_models(_: Path) -> Iterator[Case]:
@@ -557,10 +558,12 @@ def test_wrong_arguments_are_refused(
 
 LEFT_OUT = {
     **dict.fromkeys(
-        ("advance", "batched", "move", "noise_key", "take"), "for loops of this package"
+        ("advance", "batched", "by_structure", "move", "noise_key", "take"),
+        "for loops of this package",
     ),
     **dict.fromkeys(
-        ("may_have", "is_set_at_once", "usual_columns", "for_fit"), "for questions of this package"
+        ("may_have", "is_set_at_once", "usual_columns", "for_fit", "of_each"),
+        "for questions of this package",
     ),
     **dict.fromkeys(
         ("of", "several", "together", "differs", "refuse"), "for many equations as one"

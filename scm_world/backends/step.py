@@ -146,13 +146,8 @@ class StepModel(Structure):
         """
         if twice:
             first, again = (self.advance(parameters, states, commands) for _ in range(2))
-            for name, where in self.layout.slices.items():
-                if first[:, where].tobytes() != again[:, where].tobytes():
-                    raise self._failure(
-                        f"gives another {name!r} when it is called again with the same arguments: "
-                        "it keeps a memory or draws random numbers of its own; declare what it "
-                        "remembers as a state, and take random numbers from its argument noise"
-                    )
+            if failure := self._of_memory(first, again):
+                raise failure
             return first
         if self.vectorized:
             return self._checked(self._call(parameters, states, commands), (len(states),))
@@ -186,6 +181,17 @@ class StepModel(Structure):
                     changed = f"changed the {kind} it was given; let it work on a copy"
                     raise self._failure(changed)
         return result
+
+    def _of_memory(self, first: Floats, again: Floats) -> EngineFailure | None:
+        """Return why equal arguments gave other numbers the second time; None if they did not."""
+        for name, where in self.layout.slices.items():
+            if first[:, where].tobytes() != again[:, where].tobytes():
+                return self._failure(
+                    f"gives another {name!r} when it is called again with the same arguments: "
+                    "it keeps a memory or draws random numbers of its own; declare what it "
+                    "remembers as a state, and take random numbers from its argument noise"
+                )
+        return None
 
     def _failure(self, what: str, **data: object) -> EngineFailure:
         return EngineFailure(f"the step function of {self.name!r} {what}", "step", **data)
@@ -293,8 +299,10 @@ class StepBatch(SeparateScenes):
         states = np.array([member._state.vector for member in members])
         parameters = np.array([member.numbers for member in members])
         counted = [member._is_taken_twice() for member in members]
-        if any(counted):
-            model.advance(parameters, states, commands, twice=True)
+        if any(counted):  # not asked again for each system: its memory is of all of them by now
+            twice = (model.advance(parameters, states, commands) for _ in range(2))
+            if failure := model._of_memory(*twice):
+                return failure
         if (model, len(members)) not in self._compared:
             among = model.advance(parameters, states, commands)
             rows = [slice(row, row + 1) for row in range(len(states))]

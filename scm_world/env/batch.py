@@ -202,7 +202,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
     def _require_episodes(self) -> None:
         for row, inner in enumerate(self._inner):
             if not inner.world.has_begun:
-                raise located(NotReset(), row, "environment")
+                raise located(NotReset(closed=inner.world._closed), row, "environment")
 
     def _shown(self) -> Any:
         shown = self._observations
@@ -421,7 +421,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         given = range(self.num_envs) if into is None else into
         others: list[Any] = [*given] if isinstance(given, Iterable) else [given]
         if others:
-            self.restore(dict.fromkeys(others, saved))
+            self.restore({numbered(one, self.num_envs): saved for one in others})
 
 
 def _copied(

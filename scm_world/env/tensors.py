@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from typing import Any, NamedTuple, final
+from typing import TYPE_CHECKING, Any, NamedTuple, final
 
 import numpy as np
 from gymnasium.vector import VectorEnv
@@ -24,6 +24,9 @@ from scm_world.world.batch import located
 from scm_world.world.philox import uniforms, words_of
 from scm_world.world.tensors import TensorRows
 
+if TYPE_CHECKING:
+    from torch import Tensor
+
 SUCCESS = "is_success"
 
 
@@ -41,11 +44,11 @@ class TensorStep(NamedTuple):
     """
 
     seen: Any
-    rewards: Any
-    terminated: Any
-    truncated: Any
+    rewards: Tensor
+    terminated: Tensor
+    truncated: Tensor
     rows: Integers
-    last: Any
+    last: Tensor
     facts: Mapping[str, Any]
 
 
@@ -59,7 +62,7 @@ class HostEnvs:
         self._torch, self._envs = load("torch", "torch", "train"), envs
         self.seen = self._torch.as_tensor(seen)
 
-    def step(self, actions: Any) -> TensorStep:
+    def step(self, actions: Tensor) -> TensorStep:
         """Advance all environments a control step; see ``TensorEnvs.step``."""
         seen, *flags, infos = self._envs.step(actions.cpu().numpy())
         rewards, terminated, truncated = map(self._torch.as_tensor, flags)
@@ -215,7 +218,7 @@ class TensorEnvs:
         self.copies["noise to the device"] += drawn.nbytes
         return self._torch.as_tensor(drawn, device=self._rows.table.device)
 
-    def step(self, actions: Any) -> TensorStep:
+    def step(self, actions: Tensor) -> TensorStep:
         """Advance all environments a control step; episodes that are over begin anew.
 
         Args:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
+from scm_world._arguments import real_number
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 from scm_world.fit.problem import SHORT, FitProblem, LeastSquares, by_column, windows_of
@@ -107,7 +108,7 @@ def predicted(fit: Fit, measured: Measurements, ahead: float | None) -> Predicti
     steps = [int(run.instants[-1]) / (len(run.instants) - 1) for run in measured.runs]
     period = measured.control_dt * float(np.median(steps))
     if ahead is not None:
-        rows = round(ahead / period)
+        rows = round(real_number("ahead", ahead) / period)
     windows = [w for w in windows_of(measured.runs, SHORT + rows) if w.last - w.first > SHORT]
     if rows < 1 or not windows:
         allowed = (f"runs of more than {SHORT} rows: the first {SHORT} show where each begins",)

@@ -102,6 +102,8 @@ class RecordedRun:
         begin: Time of its first row [s].
         whole: Whether it begins with the recording, and not after a gap.
         do: Its set-up: values of parameters that were set for it, by columns.
+        before: Commands of the control steps before its first row, if they are known, shape
+            (steps, n_actions), of which a delay has the last ones.
     """
 
     commands: Floats
@@ -110,6 +112,7 @@ class RecordedRun:
     begin: float = 0.0
     whole: bool = True
     do: Mapping[str, float] = field(default_factory=dict)
+    before: Floats | None = None
 
     @cached_property
     def filled(self) -> Floats:
@@ -121,12 +124,22 @@ class RecordedRun:
                 column[:] = np.interp(self.instants, self.instants[seen], column[seen])
         return found
 
+    def late(self, steps: Integers) -> Floats:
+        """Return the commands of control steps, also of those before the first row (n, n_actions).
+
+        Where it is not known, the first command is assumed to hold before.
+        """
+        before = self.commands[:0] if self.before is None else self.before
+        sent = np.concatenate([before, self.commands])
+        return sent[np.clip(steps + len(before), 0, len(sent) - 1)]
+
     def part(self, first: int, last: int, control_dt: float) -> RecordedRun:
         """Return the run from a row to that before another one, with the length of a step [s]."""
         since, instants = int(self.instants[first]), self.instants[first:last]
         sent = self.commands[since : int(instants[-1])]
         begin, whole = self.begin + control_dt * since, self.whole and not first
-        rest = self.values[first:last], begin, whole, self.do
+        before = self.late(np.arange(since))
+        rest = self.values[first:last], begin, whole, self.do, before
         return RecordedRun(sent, instants - since, *rest)
 
 
@@ -265,9 +278,7 @@ class Reading(NamedTuple):
 
     def named(self, table: Any) -> Any:
         """Return a table or arrays by name, with the names of this world."""
-        import pandas as pd
-
-        if not (self.columns or self.ignore) or not isinstance(table, Mapping | pd.DataFrame):
+        if not (self.columns or self.ignore):
             return table
         columns, names = self.columns or {}, {str(name).strip(): name for name in table}
         if missing := [name for name in columns if name not in names]:
@@ -275,7 +286,10 @@ class Reading(NamedTuple):
         ignore = as_names(self.ignore)
         kept = {own: name for name, own in names.items() if not fits(name, ignore)}
         if isinstance(table, Mapping):
-            return {columns.get(name, name): table[own] for own, name in kept.items()}
+            found = {columns.get(name, name): table[own] for own, name in kept.items()}
+            if len(found) < len(kept):
+                raise ModelError(["columns= gives two columns one name: leave one out by ignore="])
+            return found
         return table[[*kept]].rename(columns=lambda own: columns.get(kept[own], kept[own]))
 
 
@@ -299,6 +313,8 @@ def read_recording(
         ModelError: The tables have faults; see ``World.fit``.
         UnreadableFile: A file cannot be read.
     """
+    import pandas as pd
+
     known = columns_of(world)
     frames: list[tuple[str, pd.DataFrame, bool]] = []
     every = [*recording] if isinstance(recording, list | tuple) else [recording]
@@ -306,10 +322,14 @@ def read_recording(
     setups = [{}] * len(every) if how.setups is None else how.setups
     if len(setups) != len(every):
         raise UnknownOption("setups", f"{len(setups)} set-ups", (f"{len(every)}, one of each",))
-    for number, (one, setup) in enumerate(zip(every, setups, strict=True), 1):
+    for number, (one, setup) in enumerate(zip(every, setups, strict=True)):
         label = f"run {number}" if one is not recording else ""
         label, table = (str(one), _file(one)) if isinstance(one, str | Path) else (label, one)
-        frames += _frames(world, how.named(table), label, setup)
+        if isinstance(table, Mapping | pd.DataFrame):
+            frames += _frames(world, how.named(table), label, setup)
+        else:
+            made = _frames(world, table, label, setup)
+            frames += [(n, how.named(frame), by) for n, frame, by in made]
     if not frames:
         raise UnknownOption("recording", recording, ("one or more runs",))
     for label, frame, _ in frames:
@@ -408,12 +428,13 @@ def _frames(
 
     if do:
         setup = {f"{DO}{name}": value for name, value in setup_of(world, do).items()}
-        yield from ((n, frame.assign(**setup), by) for n, frame, by in _frames(world, given, label))
+        made = _frames(world, given, label)
+        yield from ((name, _set_up(frame, setup), simulated) for name, frame, simulated in made)
         return
 
     dt = world.options.control_period
     if isinstance(given, list | tuple):
-        for number, one in enumerate(given, 1):
+        for number, one in enumerate(given):
             yield from _frames(world, one, f"run {number}")
     elif isinstance(given, str | Path):
         yield from _frames(world, _file(given), str(given))
@@ -447,6 +468,12 @@ def _frames(
         yield from ((name, part, True) for name, part, _ in _frames(world, frame, label))
     else:
         raise UnknownOption("recording", type(given).__name__, KINDS)
+
+
+def _set_up(frame: pd.DataFrame, setup: Mapping[str, float]) -> pd.DataFrame:
+    """Return a table with the columns of a set-up, which it has not yet."""
+    _refuse(f"{n} is in the recording, and in its set-up: give one" for n in setup if n in frame)
+    return frame.assign(**setup)
 
 
 def _refuse_scaled(given: object) -> None:
@@ -511,18 +538,34 @@ def _separated(data: bytes) -> pd.DataFrame:
     import pandas as pd
 
     lines = [line for line in data.decode("utf-8-sig").splitlines() if line.strip(" \t,;")]
-    comments = [line for line in lines if line.lstrip()[0] in "#%"]
-    rows = [line for line in lines if line.lstrip()[0] not in "#%"]
-    if rows and comments and not re.search("[A-Za-z]", rows[0]):
-        rows = [comments[-1].lstrip(" #%\t"), *rows]
+    comments = [line.lstrip()[0] in "#%" for line in lines]
+    rows = [line for line, comment in zip(lines, comments, strict=True) if not comment]
+    first = comments.index(False) if rows else 0
+    if first and not re.search(
+        "[a-z]", re.sub(r"(?<=[\d.])e(?=[-+\d])|\bnan\b", "", rows[0].lower())
+    ):
+        rows = [lines[first - 1].lstrip(" #%\t"), *rows]
     separator = next((one for one in ";\t," if one in (rows or [""])[0]), r"\s+")
-    commas = separator != "," and any("," in line for line in rows[1:])
-    how: dict[str, Any] = {
-        "sep": separator,
-        "decimal": "," if commas else ".",
-        "skipinitialspace": True,
-    }
-    frame: pd.DataFrame = pd.read_csv(io.StringIO("\n".join(rows)), **how)
+    cell = re.compile(
+        rf"(?:^|{separator})[\s\"]*[-+]?\d*,\d+(?:e[-+]?\d+)?[\s\"]*(?:$|{separator})", re.I
+    )
+    commas = separator != "," and any(map(cell.search, rows[1:]))
+    text, decimal = io.StringIO("\n".join(rows)), "," if commas else "."
+    frame: pd.DataFrame = pd.read_csv(text, sep=separator, decimal=decimal, skipinitialspace=True)
+    names = [*frame.columns]
+    cells = {len(re.findall(r'"[^"]*"|\S+', line)) for line in rows if separator == r"\s+"}
+    short = len(cells) > 1  # where empty cells cannot be seen
+    if not isinstance(frame.index, pd.RangeIndex):  # rows have more cells than there are names
+        more = frame.index.nlevels
+        short = short or bool(frame.iloc[:, -more:].notna().any(axis=None))
+        frame = frame.reset_index().iloc[:, : len(names)].set_axis(names, axis=1)
+    if short:
+        said = f"rows have more or fewer cells than the {len(names)} names {', '.join(names)}"
+        raise ModelError([f"{said}: write nan in empty cells, or separate them by semicolons"])
+    texts = [n for n in names if commas and not pd.api.types.is_numeric_dtype(frame[n])]
+    if mixed := [n for n in texts if frame[n].astype(str).str.fullmatch(r"[-+]?\d*\.\d+").any()]:
+        said = f"the column {mixed[0]!r} has points, and others have decimal commas"
+        raise ModelError([f"{said}: write all numbers in one way, without separated thousands"])
     return frame
 
 

@@ -50,6 +50,7 @@ from scm_world.fit.targets import (
     twin_of,
     values_of,
 )
+from scm_world.fit.units import check_units
 from scm_world.geometry.rotations import aligned
 from scm_world.queries.world import World
 from scm_world.runs.canvas import PALETTE, blank, styled
@@ -400,8 +401,8 @@ class Fit:
         """Runs that are played from their first row, without measurements on the way.
 
         A row for each measured column, with its ``unit`` and the root mean square of measured
-        minus played, by the ``fit``, by the ``unfitted`` world from the same start, and by a
-        ``constant``, the mean of the column.
+        minus played, by the ``fit``, by the ``unfitted`` world, and by a ``constant``, the mean of
+        the column. Each begins with the start state with which it fits the first window best.
         """
         import pandas as pd
 
@@ -447,11 +448,13 @@ class Fit:
 
         Raises:
             UnknownOption: No window has a row to predict.
-            ModelError: The recording has faults.
+            ModelError: The recording has faults, or is in degrees.
         """
         with twin_of(self.asked) as twin:
             how = Reading(None, columns, ignore)
-            return predicted(self, read_recording(twin, recording, how), ahead)
+            measured = read_recording(twin, recording, how)
+        check_units(self.asked, measured)
+        return predicted(self, measured, ahead)
 
     @property
     def spread(self) -> Floats:
@@ -467,6 +470,7 @@ class Fit:
         """
         return posterior_of(self.targets, self.scaled, self.spread)
 
+    @typed
     def save(self, path: str | Path) -> None:
         """Write the fit to a file, as its ending says.
 

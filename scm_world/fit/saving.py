@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import re
+import uuid
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +15,7 @@ import numpy as np
 from scm_world._arguments import load
 from scm_world._types import Floats
 from scm_world.errors import ModelError, ScmWorldError, UnknownOption
-from scm_world.fit.targets import twin_of, values_of
+from scm_world.fit.targets import LATE, twin_of, values_of
 from scm_world.runs.canvas import png
 from scm_world.runs.files import write_whole
 from scm_world.tasks.model import ModelTask
@@ -26,6 +27,7 @@ CLOSE = 1e-9  # largest relative difference of a number that was written and rea
 DRIVEN = ("gear", "kp", "kv", "gain", "bias", "forcerange", "ctrlrange", "timeconst")
 STYLE = "body{font:16px/1.5 sans-serif;max-width:60em;margin:2em auto;padding:0 1em}"
 STYLE += "table{border-collapse:collapse}td,th{padding:.2em .8em;text-align:right}img{width:100%}"
+OTHER = r"<!--.*?-->|<(sensor|equality|keyframe)\b[^>/]*>.*?</\1>|<(?:site|camera|light)\b[^>]*>"
 INSIDE = {"mass": ("mass", "value"), "damping": ("dynamics", "damping")}
 INSIDE["frictionloss"] = ("dynamics", "friction")  # of URDF: a child and its attribute
 
@@ -72,15 +74,17 @@ def as_page(fit: Fit) -> str:
 def _save_model(fit: Fit, path: Path) -> None:
     """Write the file that the world was made from, with the fitted numbers; read it to check."""
     build, (kind, task, options, _), *_ = fit.asked.__reduce__()
-    given = task.given.get("model", "") if isinstance(task, ModelTask) else ""
-    if not isinstance(given, str | Path) or not str(given):
+    source = task.given.get("model", "") if isinstance(task, ModelTask) else ""
+    if not isinstance(source, str | Path) or not str(source):
         raise ModelError(["the world was not made from a model file: save values as .yaml"])
-    whole = str(given).lstrip().startswith("<")
-    before = str(given) if whole else Path(given).read_text("utf-8")
-    values = values_of(fit.targets, fit.scaled)
-    after, trial = before, path.with_name(f"trial-{path.name}")
+    whole = str(source).lstrip().startswith("<")
+    before = str(source) if whole else Path(source).read_text("utf-8")
+    after, trial = before, path.with_name(f"{uuid.uuid4().hex}{path.suffix}")
     with twin_of(fit.asked) as twin:
-        names = twin.compiled.static_names
+        names = [n for n in twin.compiled.static_names if not n.endswith(LATE)]
+        given = {n: np.array(twin[n]) for n in fit.asked.plan.at_start() if n in names}
+        fitted = values_of(fit.targets, fit.scaled)
+        values = given | {n: value for n, value in fitted.items() if not n.endswith(LATE)}
         wanted = {name: np.array(values.get(name, twin[name])) for name in names}
         system: Any = twin.composition.system
         mj = system.source.realized
@@ -93,15 +97,13 @@ def _save_model(fit: Fit, path: Path) -> None:
             world.reset(seed=0)
             read = {name: np.array(world[name]) for name in names if name in world.model}
     except ScmWorldError as error:
-        advice = "save it beside the original, whose files it names"
+        advice = "save it beside the original, if it names other files, or save values as .yaml"
         raise ModelError([f"{path.name} cannot be read again: {error}; {advice}"]) from error
     finally:
         trial.unlink(missing_ok=True)
-    known = fit.asked.plan.at_start()
-    shown = {n: v for n, v in wanted.items() if n in values or n not in known}
     lost = [
         name
-        for name, value in shown.items()
+        for name, value in wanted.items()
         if name not in read or not np.allclose(read[name], value, rtol=CLOSE, atol=1e-300)
     ]
     if lost:
@@ -113,7 +115,7 @@ def _save_model(fit: Fit, path: Path) -> None:
 def _with(text: str, name: str, values: Mapping[str, Floats], mj: Any) -> str:
     """Return the text of a model with other numbers of one parameter; as it is if it cannot be."""
     element, _, attribute = name.rpartition(".")
-    hidden = re.sub(r"<!--.*?-->", lambda found: " " * len(found[0]), text, flags=re.S)
+    hidden = re.sub(OTHER, lambda found: " " * len(found[0]), text, flags=re.S)
     tags = _tags(hidden, element, attribute)
     root = re.search(r"<mujoco\b[^>]*>", hidden)
     if not tags and not element and root:
@@ -134,8 +136,10 @@ def _with(text: str, name: str, values: Mapping[str, Floats], mj: Any) -> str:
         inner = re.compile(r"<inertial\b[^>]*>|</?body\b").search(hidden, tag.end())
         about = mj.body(element)
         if inner is None or not inner[0].startswith("<inertial"):
-            parts = {"pos": about.ipos, "quat": about.iquat, "mass": values[f"{element}.mass"]}
-            parts["diaginertia"] = values[f"{element}.inertia"]
+            mass, inertia = (values.get(f"{element}.{n}") for n in ("mass", "inertia"))
+            parts = {"pos": about.ipos, "quat": about.iquat}
+            parts["mass"] = about.mass if mass is None else mass
+            parts["diaginertia"] = about.inertia if inertia is None else inertia
             words = " ".join(f'{key}="{_written(numbers)}"' for key, numbers in parts.items())
             return f"{text[: tag.end()]}<inertial {words}/>{text[tag.end() :]}"
         tag, attribute = inner, {"inertia": "diaginertia"}.get(attribute, attribute)

@@ -223,15 +223,20 @@ class Minima:
     def played(self, scaled: Floats) -> Floats:
         """Return how far runs that are played from their first row are from the measurements.
 
-        Their start states are guessed from the measurements. It is the root mean square of each
-        column, with scaled parameters and without a fit, shape (2, columns).
+        Their start states are those of their first windows, as each world fits them best. It is
+        the root mean square of each column, with scaled parameters and without a fit, shape
+        (2, columns).
         """
         problem, plain = self.problem, np.ones(len(self.problem.measured.columns))
-        windows, column = windows_of(problem.measured.runs, None), problem.measured.cells[1]
+        runs, column = problem.measured.runs, problem.measured.cells[1]
+        first = [[one] for one in windows_of(runs, problem.window) if not one.first]
         pairs = zip(problem.segments, self._guess, strict=True)
-        starts = [start for segment, start in pairs if not segment.first]
+        guess = [start for segment, start in pairs if not segment.first]
+        squares = LeastSquares(problem, first, problem.noise, ())
+        windows = windows_of(runs, None)
 
         def sizes(numbers: Floats) -> Floats:
+            starts = gauss_newton(squares, numbers, guess).starts
             tasks = [(one, numbers, start) for one, start in zip(windows, starts, strict=True)]
             made = zip(windows, problem.simulator.simulate(tasks), strict=True)
             left = np.concatenate([problem.residual(one, it.values, plain) for one, it in made])

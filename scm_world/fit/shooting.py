@@ -162,7 +162,7 @@ class Shooting(Simulator):
                     mine[speed] = True
             for i, past in remembered(world).items() if len(run.commands) else ():
                 sent = run.instants[first] - 1 - np.arange(past.stop - past.start)
-                vector[past], mine[past] = run.commands[np.maximum(sent, 0), i], True
+                vector[past], mine[past] = run.late(sent)[:, i], True
             for place, i in begun if not first and run.whole else ():
                 vector[place], mine[place] = run.values[0, i], True
             for turned_places in self.turned:
@@ -272,14 +272,14 @@ class Shooting(Simulator):
 
         Shape (n, substeps, n_actions), or (n, n_actions) without delays, or with one physics step.
         """
-        world, sent = self._batch.world(0), run.commands
-        delays, last = delays_of(world, self.targets, scaled), len(sent) - 1
-        if not delays.any() or not len(sent):
-            return sent[steps]
+        world = self._batch.world(0)
+        delays = delays_of(world, self.targets, scaled)
+        if not delays.any() or not len(run.commands):
+            return run.commands[steps]
         acting = np.empty((len(steps), world.substeps, len(delays)))
         for i, delay in enumerate(delays.tolist()):
             whole, shares = switched(delay, world.substeps)
-            new, old = (sent[np.clip(steps - whole - late, 0, last), i, None] for late in (0, 1))
+            new, old = (run.late(steps - whole - late)[:, i, None] for late in (0, 1))
             acting[..., i] = new + np.array(shares or (0.0,)) * (old - new)
         return acting if world.substeps > 1 else acting[:, 0]
 

@@ -16,6 +16,7 @@ import math
 import operator
 from collections.abc import Callable, Iterable
 from functools import cache, partial
+from itertools import combinations
 from types import FunctionType, SimpleNamespace
 from typing import Any, final
 
@@ -130,12 +131,17 @@ class Trace:
 
     def inner(self, function: Any, arguments: list[Any]) -> Any:
         """Call a function within the one that is traced: its decisions are joined at its end."""
-        before = self.answers
+        before, arrays = self.answers, [one for one in arguments if isinstance(one, np.ndarray)]
+        if any(np.may_share_memory(*pair) for pair in combinations(arrays, 2)):
+            raise Untraceable("two of its arguments are parts of one array")  # copied below
         found, *written = self._explored(function, arguments, before)
         self.answers = before
         for array, after in zip(arguments, written, strict=True):
-            if isinstance(array, np.ndarray) and array.dtype == object:
-                array[...] = after
+            if isinstance(array, np.ndarray):
+                try:
+                    array[...] = after
+                except TypeError as error:
+                    raise Untraceable(str(error)) from None
         return found
 
     def _explored(
@@ -329,15 +335,21 @@ class Expressions:
 
 
 def _operation(torch: Any, name: str) -> Callable[..., Any]:
+    """Return an operation on tensors and numbers, in which a truth counts as 0 or 1.
+
+    For torch, truths have no difference, and a truth times a number has 32 bits.
+    """
     function: Callable[..., Any] = getattr(operator, name, None) or getattr(torch, name)
-    if name not in ("minimum", "maximum", "atan2", "where"):
-        return function
+    takes_numbers = name not in ("minimum", "maximum", "atan2", "where")
 
-    def of_tensors(*given: Any) -> Any:  # which do not take numbers, or round them to 32 bits
+    def of_tensors(*given: Any) -> Any:
         like = next(one for one in given if torch.is_tensor(one))
-        return function(*(one if torch.is_tensor(one) else new(like, one) for one in given))
-
-    def new(like: Any, number: float) -> Any:
-        return torch.full((), number, dtype=torch.float64, device=like.device)
+        wide = [one.double() if torch.is_tensor(one) else one for one in given]
+        if not takes_numbers:
+            full = partial(torch.full, (), dtype=torch.float64, device=like.device)
+            wide = [one if torch.is_tensor(one) else full(one) for one in wide]
+        if name == "where":
+            wide[0] = wide[0] != 0.0
+        return function(*wide)
 
     return of_tensors

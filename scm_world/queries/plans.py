@@ -411,7 +411,8 @@ class Plan(Mapping[str, tuple[Intervention, ...]]):
                 if moved and _level(world, step, levels, moved, memory) is not None:
                     return None
                 request = _requests(world, moved, chains, memory)
-                for name, act in request.items():
+                hidden = [(one.name, at_once(one.act)) for one in forces if one.act.draws]
+                for name, act in (*request.items(), *hidden):
                     world.model.accept(name, act)
                 names = {*chains, *compiled.static_order(tuple(chains))}
             except InterventionError:  # which is that of each episode

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import chain, count
+from itertools import chain, count, repeat
 from typing import TYPE_CHECKING, Any, Self, final
 
 import numpy as np
@@ -196,7 +196,8 @@ class Questions:
         done = count(1)
 
         def outcomes_of(episodes: Episodes) -> Iterator[tuple[Floats, ...]]:
-            return zip(*(read_each(one, episodes) for one in wanted), strict=True)
+            of_each = [read_each(one, episodes) for one in wanted]  # may be empty
+            return zip(*of_each, strict=True) if of_each else repeat((), len(episodes))
 
         def finish(episodes: Episodes) -> Iterator[tuple[Floats, ...]]:
             for row in outcomes_of(episodes):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
@@ -16,6 +16,9 @@ from scm_world.variables.distributions import word_of
 from scm_world.world.audit import Audits
 from scm_world.world.batch import Batch
 from scm_world.world.mechanisms import Rows
+
+if TYPE_CHECKING:
+    from scm_world.queries.twins import Twins
 
 
 @final
@@ -112,7 +115,9 @@ def is_known(unit: Unit) -> bool:
     return isinstance(as_policy(unit.policy), OpenLoopPolicy) and ALL not in unit.names
 
 
-def run_together(batch: Batch, units: Sequence[Unit], twins: Any = None) -> Iterator[Result]:
+def run_together(
+    batch: Batch, units: Sequence[Unit], twins: Twins | None = None
+) -> Iterator[Result]:
     """Run units in the rows of a batch, which has at least as many worlds.
 
     They have equal instants, names that the batch computes, and one open-loop policy. Those that
@@ -129,7 +134,7 @@ def run_together(batch: Batch, units: Sequence[Unit], twins: Any = None) -> Iter
 class _Together:
     """Units in the rows of a batch: first those that act together, last those with own worlds."""
 
-    def __init__(self, batch: Batch, units: Sequence[Unit], twins: Any) -> None:
+    def __init__(self, batch: Batch, units: Sequence[Unit], twins: Twins | None) -> None:
         self._batch, self._twins = batch, twins
         self._first, self._steps = units[0].first, units[0].steps
         self._names, self._ends = units[0].names, units[0].ends

@@ -18,7 +18,7 @@ import numpy as np
 from scm_world._arguments import whole_number
 from scm_world._fingerprint import digest, fingerprint
 from scm_world._types import Floats
-from scm_world.errors import ScmWorldError, UnknownOption
+from scm_world.errors import EngineFailure, ScmWorldError, UnknownOption
 from scm_world.graph import SCM
 from scm_world.policies.scripted import OpenLoopPolicy, as_policy
 from scm_world.queries.episodes import Episode, Era, Unit
@@ -237,8 +237,11 @@ class Twins:
                 some = [units[place] for place in here]
                 try:
                     parts = [*run_together(batch, some, self)]
-                except ScmWorldError:  # run separately, it ends its own unit only
+                except ScmWorldError as error:  # run separately, it ends its own unit only
                     parts = [([place], self._alone(unit)) for place, unit in enumerate(some)]
+                    alike = all(isinstance(result, EngineFailure) for _, result in parts)
+                    if alike and isinstance(error, EngineFailure) and not error.lost:
+                        raise  # it is of the engine as such, which has been asked again since
                 for places, result in parts:
                     yield [here[place] for place in places], result
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -181,9 +182,11 @@ class Audits(Mapping[int, Audit]):
             line = f"{name}: {_range([one.applied for one in found])} in {_worlds(len(found))}"
             back = [one.read_back for one in found if one.read_back is not None]
             lines.append(line + (f", engine reports {_range(back)}" if back else ""))
-        for what in sorted({name for audit in self.values() for name in audit.followed}):
-            count = sum(what in audit.followed for audit in self.values())
-            lines.append(f"  follows: {what} in {_worlds(count)}")
+        for said, of in (("follows", "followed"), ("new", "came"), ("gone", "went")):
+            each = [name for audit in self.values() for name in getattr(audit, of)]
+            lines += [
+                f"  {said}: {what} in {_worlds(n)}" for what, n in sorted(Counter(each).items())
+            ]
         for remark in sorted({one for audit in self.values() for one in audit.remarks}):
             count = sum(remark in audit.remarks for audit in self.values())
             lines.append(f"  note in {_worlds(count)}: {remark}")

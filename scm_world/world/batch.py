@@ -469,8 +469,10 @@ class Batch(WorldsInRows):
             if parameters or moved:
                 states = then[places, :size] if moved else None
                 self._engine.apply(rows[places], parameters, states)
+        layout = compiled.composition.system.layout
+        held = layout.can_be_set & ~layout.engine_takes  # of which the engine knows nothing
         numbers[:] = then
-        numbers[:, :size] = self._engine.read(rows)
+        numbers[:, :size] = np.where(held, then[:, :size], self._engine.read(rows))
         numbers[:, compiled.fresh] = 0.0
 
     def _check(self, table: Rows, fresh: Integers) -> None:

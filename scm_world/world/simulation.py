@@ -667,13 +667,15 @@ class Simulation(CausalSystem):
         self.substeps = physics_steps(self.options, structure)
 
     def _adopt_model(self, model: SCM) -> None:
-        acts = {name: model._act_on(name) for name in self.compiled.actions}
-        roots = {name: act.root for name, act in acts.items() if act is not None}
-        self.graph, self._held_actions = model, tuple(roots)
+        acts = [(name, model._act_on(name)) for name in self.compiled.actions]
+        roots = {name: act.root for name, act in acts if act is not None}
+        self.graph, self._held_actions = model, (*roots,)
         self.holds_actions = bool(roots)
         self.acts_alone = self._translates or self.holds_actions
-        follow = (of.intervention.follows(of.requested) for of in roots.values())
-        self._inputs = tuple(p.name for parents in follow for p in parents)
+        self._inputs: tuple[str, ...] = ()  # what the interventions on actions read
+        for root in roots.values():
+            followed = root.intervention.follows(root.requested)
+            self._inputs += tuple(parent.name for parent in followed)
 
     # --- state ------------------------------------------------------------------------
 

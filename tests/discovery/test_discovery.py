@@ -82,6 +82,7 @@ def tampered_world(monkeypatch: pytest.MonkeyPatch, tamper: Tampered) -> Simulat
 
     honest = BlockWorld.variables
     monkeypatch.setattr(BlockWorld, "variables", lambda self: tuple(tamper(honest(self))))
+    monkeypatch.setattr("scm_world.world.structures._ALIVE", {})  # honest worlds may be alive
     return Simulation("pushing")
 
 

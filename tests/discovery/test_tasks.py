@@ -103,6 +103,7 @@ def test_a_false_edge_into_a_mechanism_is_missed(monkeypatch: pytest.MonkeyPatch
         )
 
     monkeypatch.setattr(BlockWorld, "variables", tampered)
+    monkeypatch.setattr("scm_world.world.structures._ALIVE", {})  # honest worlds may be alive
     report = found("stacked_blocks", "fake", 1, SMALL["stacked_blocks"])
     assert ("floor_friction", "tool_level_0_num_0.mass", 0) in report.score.missed
     assert ("blocks_mass", "tool_level_0_num_0.mass", 0) in report.found

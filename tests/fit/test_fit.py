@@ -541,7 +541,7 @@ def test_readouts_are_measurements(world: sw.World) -> None:
         (lambda d: d.iloc[:3], UnknownOption, "at least"),
         (lambda d: d.assign(**{"pole.mass": 0.2}), ModelError, "not measured"),
         (lambda d: d.assign(**{"hinge.position": "low"}), ModelError, "not numbers"),
-        (lambda d: [d, d.assign(knee=0.0)], ModelError, "run 2: rename .* 'knee'"),
+        (lambda d: [d, d.assign(knee=0.0)], ModelError, "run 1: rename .* 'knee'"),
         (lambda d: {"time": d.time, "hinge.position": [0.0]}, ModelError, "a row for each instant"),
         (lambda d: 5, UnknownOption, ".csv, .txt, .tsv, .parquet or .npz"),
         (lambda d: [], UnknownOption, "one or more runs"),

@@ -70,6 +70,14 @@ def test_a_delay_that_ends_within_a_control_step_is_recovered() -> None:
     assert found >= 5
 
 
+def test_rows_that_were_held_out_know_the_commands_before_them() -> None:
+    """The commands that act after the cut were sent before it; what is left is the noise."""
+    with sw.World(ARM, control_dt=0.02) as world:
+        fit = world.fit(recorded(1, (120, 120)), ["s.kp", "delay"], held_out=0.5)
+        assert fit.held_out is not None
+        assert fit.held_out.table.fit[0] < 1.5e-3
+
+
 def test_each_command_has_its_own_delay() -> None:
     """The fitted world has them, and replays the recording."""
     run = recorded(2, (14, 33))

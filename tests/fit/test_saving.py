@@ -89,6 +89,32 @@ def test_the_own_file_has_the_fitted_numbers_and_its_comments(tmp_path: Path) ->
     assert "data:image/png;base64," in page
 
 
+def test_given_values_are_written_with_the_fitted_ones(tmp_path: Path) -> None:
+    """The mass that was given is written, a delay is not; a sensor is named like the motor."""
+    text = MODEL.replace(
+        "<worldbody>", "<sensor><jointpos name='motor' joint='hinge'/></sensor><worldbody>"
+    )
+    world = sw.World(text).given({"pole.mass": 0.4, "hinge.position": 0.5})
+    fit = world.fit(recorded(world, {"motor.gear": 1.3}), ["motor.gear"], noise=1e-3)
+    fit.save(tmp_path / "arm.xml")
+    plain = mujoco.MjModel.from_xml_path(str(tmp_path / "arm.xml"))
+    assert plain.body("pole").mass[0] == 0.4
+    assert plain.actuator_gear[0, 0] == fit.values["motor.gear"]
+    late = sw.World(MODEL, delay={"motor.control": sw.Box(0.0, 3.0)})
+    names = ["motor.gear", "motor.control_delay"]
+    fit = late.fit(recorded(late, {"motor.control_delay": 1.4, "motor.gear": 1.3}), names)
+    fit.save(tmp_path / "late.xml")
+    plain = mujoco.MjModel.from_xml_path(str(tmp_path / "late.xml"))
+    assert plain.actuator_gear[0, 0] == fit.values["motor.gear"]
+    (tmp_path / "trial-narrow.xml").write_text("of the user")
+    narrow = sw.World(MODEL, expose=["pole.inertia"])
+    fit = narrow.fit(recorded(narrow, {}), ["pole.inertia"], noise=1e-3)
+    fit.save(tmp_path / "narrow.xml")
+    assert (tmp_path / "trial-narrow.xml").read_text() == "of the user"
+    plain = mujoco.MjModel.from_xml_path(str(tmp_path / "narrow.xml"))
+    assert plain.body("pole").mass[0] == 0.2
+
+
 def test_what_cannot_be_written_is_refused_and_nothing_is(tmp_path: Path) -> None:
     """An element without a name of its own in the file, another ending, no file."""
     text = MODEL.replace(' name="motor"', "")

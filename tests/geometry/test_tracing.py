@@ -54,6 +54,42 @@ def counted(point: Any, angle: float) -> int:
     return int(point[0] < angle)
 
 
+@njit(cache=True)
+def _five(array: Any) -> None:
+    array[1] = 5.0
+
+
+@njit(cache=True)
+def truths(point: Any, angle: float) -> Any:
+    """Count, subtract and weigh truths, and ask whether a number is not zero."""
+    a, b = point[0] > 0.0, point[1] > angle
+    found = np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8])
+    _five(found)
+    seen = np.zeros(9)
+    seen[0], seen[1], seen[2], seen[3] = 0.1 * a, a + b, a - (b + 0), -(a + 0.0)
+    seen[4], seen[5], seen[6] = a / 3.0, a * b * 0.3, abs(a - 1.0) * 0.7
+    seen[7] = (2.0 if point[0] else 1.0) + np.sign(a + 0.0) * 0.1
+    seen[8] = found[1]
+    return seen
+
+
+@njit(cache=True)
+def _marked(array: Any, number: float) -> None:
+    if number > 0.0:
+        array[0] = 1.0
+
+
+@njit(cache=True)
+def _both(one: Any, other: Any) -> None:
+    one[0] = 3.0
+    other[0] += one[0]
+
+
+def _twice(point: Any, _: float) -> Any:
+    _both(point, point)
+    return point[0]
+
+
 def _columns(function: Any, size: int) -> tuple[Any, Any]:
     trace = Trace()
     point = np.array([trace.column(0), trace.column(1)])
@@ -65,7 +101,9 @@ def _columns(function: Any, size: int) -> tuple[Any, Any]:
     return given, table[3:].numpy()
 
 
-@pytest.mark.parametrize(("function", "size"), [(turned, 2), (decided, 1), (counted, 1)])
+@pytest.mark.parametrize(
+    ("function", "size"), [(turned, 2), (decided, 1), (counted, 1), (truths, 9)]
+)
 def test_columns_have_the_numbers_of_the_compiled_function(function: Any, size: int) -> None:
     """Also where a world takes another branch than its neighbour."""
     given, found = _columns(function, size)
@@ -83,6 +121,8 @@ def test_columns_have_the_numbers_of_the_compiled_function(function: Any, size: 
         (lambda point, _: sum(1.0 for one in np.linspace(0.0, 1.0, 40) if one < point[0]), "often"),
         (lambda point, _: np.array([0.0]).__setitem__(0, point[0]), "float"),
         (lambda point, _: point[0] ** 3, "power"),
+        (lambda point, _: _marked(np.array([0.0]), point[0]), "float"),
+        (_twice, "parts of one array"),
     ],
 )
 def test_what_symbols_cannot_say_is_refused(source: Any, why: str) -> None:

@@ -14,7 +14,13 @@ import pytest
 from scm_world.backends.mujoco.batch import MujocoBatch
 from scm_world.discovery.data import Design
 from scm_world.discovery.data.worlds import EpisodeRows
-from scm_world.errors import EngineFailure, OutOfBounds, UnknownOption, UnknownVariable
+from scm_world.errors import (
+    EngineFailure,
+    InterventionError,
+    OutOfBounds,
+    UnknownOption,
+    UnknownVariable,
+)
 from scm_world.graph import SCM
 from scm_world.queries import Outcome, World
 from scm_world.queries import twins as parallel
@@ -190,6 +196,16 @@ def test_rows_of_one_plan_are_those_alone(backend: str, n: int) -> None:
             assert all(map(same_values, row, (one[name] for name in names)))
         else:
             assert str(row) == str(one)
+
+
+def test_a_context_that_cannot_be_drawn_is_refused_in_rows_too() -> None:
+    """Though an intervention replaces it."""
+    world = World("pushing", backend="fake")
+    nature = {"goal_block.cartesian_position": "A"}  # its cylindrical position has a space A
+    do = {"goal_block.cylindrical_position": Draw("A")}
+    for n in (2, parallel.LEAST + 5):
+        with pytest.raises(InterventionError, match="no space A"):
+            world.sample(n, do, outcomes=["reward"], nature=nature, steps=2)
 
 
 def test_rows_that_were_drawn_have_counterfactuals() -> None:

@@ -117,6 +117,7 @@ def tampered(monkeypatch: pytest.MonkeyPatch, name: str, change: Callable[..., A
         )
 
     monkeypatch.setattr(BlockWorld, "variables", variables)
+    monkeypatch.setattr("scm_world.world.structures._ALIVE", {})  # honest worlds may be alive
     return Simulation("pushing")
 
 

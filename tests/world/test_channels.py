@@ -259,3 +259,15 @@ def test_no_delay_is_no_channel() -> None:
     """A sweep over delays may begin with 0: the model is that without the option."""
     with sw.World(ARM, delay={"*.control": 0}) as none, sw.World(ARM) as plain:
         assert list(none.model.variables) == list(plain.model.variables)
+
+
+def test_sensors_err_from_the_first_instant_on_in_rows_too() -> None:
+    """The error at the beginning of an episode is drawn in many worlds as in one."""
+    with sw.World(ARM, **LATE) as one, sw.World(ARM, num_worlds=3, **LATE) as many:
+        for number in range(2):  # scenes are built, then begun again
+            many.reset(seed=5, episode=number)
+            for row in range(3):
+                one.reset(seed=5 + row, episode=number)
+                for name, values in many.values().items():
+                    np.testing.assert_array_equal(values[row], one[name], err_msg=name)
+            assert (many["hinge.velocity_error"] != 0.0).all()

@@ -14,7 +14,16 @@ from scm_world import SCM, World, do
 from scm_world.errors import ActionError, NotReset, OutOfBounds, UnknownOption, UnknownVariable
 from scm_world.queries.plans import Plan
 from scm_world.tasks import StepTask
-from scm_world.variables import Action, Box, Exogenous, Hard, Measured, Normal, Shift
+from scm_world.variables import (
+    Action,
+    Box,
+    Exogenous,
+    Hard,
+    Measured,
+    Normal,
+    Null,
+    Shift,
+)
 from scm_world.world import Batch
 
 N = 3
@@ -182,3 +191,11 @@ def test_a_held_action_ends_with_the_episode() -> None:
     worlds.step(np.full((N, 1), -0.25))
     alone.step(np.full(1, -0.25))
     assert worlds["hinge.position"][0] == alone["hinge.position"] < 0.0
+
+
+def test_audits_of_many_worlds_say_which_bodies_went() -> None:
+    """Where nothing else changes, too."""
+    worlds = World("pushing", backend="fake", num_worlds=3)
+    worlds.reset(seed=0)
+    some = np.array([True, False, True])
+    assert str(worlds.do({"tool_block": Null()}, where=some)) == "  gone: tool_block in 2 worlds"

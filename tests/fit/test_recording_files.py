@@ -54,6 +54,11 @@ TEXTS = {
     + TABLE.to_csv(index=False).replace("\n0.02", "\n# x\n0.02"),
     "a mark of the order of bytes": "\ufeff" + TABLE.to_csv(index=False),
     "names in a comment": "# arm 2\n# " + TABLE.to_csv(index=False),
+    "separators at the ends of rows": "\n".join(
+        line + ";" * bool(i) for i, line in enumerate(with_commas(";").splitlines())
+    ),
+    "names in a comment, exponents": "# time motor.control hinge.position\n"
+    + "0e+00 0.5 1.0e-3\n0.02 -2.5e-01 1.5e-3\n0.04 nan -0.25\n# end of the run\n",
     "empty rows": TABLE.to_csv(index=False) + ",,\n",
 }
 
@@ -65,6 +70,29 @@ def test_tables_of_text(world: sw.World, tmp_path: Path, text: str) -> None:
     (run,) = read_recording(world, tmp_path / "run.csv").runs
     np.testing.assert_array_equal(run.commands[:, 0], TABLE["motor.control"][:2])
     np.testing.assert_array_equal(run.values[:, 0], TABLE["hinge.position"])
+
+
+SHIFTED = {
+    "decimal commas between commas": (with_commas(","), "more or fewer cells"),
+    "an empty cell between spaces": (
+        TABLE.to_string(index=False).replace("-0.250", "      ", 1),
+        "more or fewer cells",
+    ),
+    "separated thousands": (
+        TABLE.to_csv(index=False, sep=";").replace("0.5", "1,500"),
+        "has points, and others have decimal commas",
+    ),
+}
+
+
+@pytest.mark.parametrize(("text", "said"), SHIFTED.values(), ids=SHIFTED)
+def test_numbers_that_may_be_others_are_refused(
+    world: sw.World, tmp_path: Path, text: str, said: str
+) -> None:
+    """No cell counts for its neighbour, and no thousand for one."""
+    (tmp_path / "run.csv").write_text(text.replace('"', ""))
+    with pytest.raises(ModelError, match=said):
+        read_recording(world, tmp_path / "run.csv")
 
 
 def test_columns_are_renamed_and_left_out(world: sw.World, tmp_path: Path) -> None:
@@ -82,6 +110,21 @@ def test_columns_are_renamed_and_left_out(world: sw.World, tmp_path: Path) -> No
         read_recording(world, other, Reading(None, {**columns, "speed": "hinge.velocity"}))
     with pytest.raises(ModelError, match=r"columns=\{'stamp': 'time'\}"):
         read_recording(world, other)
+
+
+def test_names_and_set_ups_that_contradict_each_other_are_refused(world: sw.World) -> None:
+    """Two columns of one name, two set-ups; episodes are renamed and left out as tables are."""
+    twice = {name: TABLE[name].to_numpy() for name in TABLE} | {"q": np.ones(3)}
+    with pytest.raises(ModelError, match="gives two columns one name"):
+        read_recording(world, twice, Reading(None, {"q": "hinge.position"}))
+    heavy = [TABLE.assign(**{"do.pole.mass": 0.4})]
+    with pytest.raises(ModelError, match=r"pole\.mass is in the recording, and in its set-up"):
+        read_recording(world, heavy, Reading([{"pole.mass": 0.5}]))
+    episode = world.rollout(steps=5)
+    seen = read_recording(world, episode, Reading(None, None, ["*.velocity"])).columns
+    assert [column.name for column in seen] == ["hinge.position"]
+    with pytest.raises(UnknownOption, match="no column of the table is named 'q'"):
+        read_recording(world, episode, Reading(None, {"q": "hinge.position"}))
 
 
 def test_clocks_that_are_no_multiple_of_the_physics_step_are_told_what_to_do() -> None:
