@@ -488,6 +488,33 @@ def randomisation() -> Any:
     return figure
 
 
+def real() -> Any:
+    """Draw errors of predictions of recordings of real machines, half a second ahead."""
+    pairs = read("real.json")["pairs"]
+    ways = {
+        "predicted": BLUE,
+        "without the do": ORANGE,
+        "file": GREY,
+        "refitted": GREEN,
+        "independent fit": SKY,
+        "constant velocity": FAINT,
+    }
+    figure = blank(9.0, 0.9 + 1.0 * len(pairs), layout="constrained")
+    axis = figure.subplots()
+    for row, found in enumerate(pairs.values()):
+        for place, (way, color) in enumerate(ways.items()):
+            each = found["errors"]["0.5"][way]
+            ends = [[each["median"] - each["low"]], [each["high"] - each["median"]]]
+            y = row + 0.13 * (place - 2.5)
+            axis.barh(y, each["median"], 0.12, color=color, label="" if row else way)
+            axis.errorbar(each["median"], y, xerr=ends, color=INK, elinewidth=0.8)
+    axis.set_yticks(range(len(pairs)), pairs)
+    axis.set(xscale="log", ylim=(len(pairs) - 0.5, -0.5))
+    axis.legend(loc="upper right")
+    titled(axis, "Median error half a second ahead", xlabel="rad (intervals of 95 % over windows)")
+    return figure
+
+
 PICTURES: Mapping[str, Callable[[], Any]] = {
     "coverage": coverage,
     "rare-failures": rare_failures,
@@ -500,6 +527,7 @@ PICTURES: Mapping[str, Callable[[], Any]] = {
     "learning": learning,
     "causes": causes,
     "randomisation": randomisation,
+    "real": real,
 }
 
 

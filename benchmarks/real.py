@@ -108,7 +108,9 @@ def two_links(v: Mapping[str, float], q: Any, u: Any) -> Any:
         load[i] -= v[f"{joint}.damping"] * q[:, 2 + i]
         load[i] -= v[f"{joint}.frictionloss"] * np.tanh(q[:, 2 + i] / SMOOTH)
     size = a11 * a22 - a12**2
-    return np.array([a22 * load[0] - a12 * load[1], a11 * load[1] - a12 * load[0]]).T / size[:, None]
+    return (
+        np.array([a22 * load[0] - a12 * load[1], a11 * load[1] - a12 * load[0]]).T / size[:, None]
+    )
 
 
 @dataclass(frozen=True)
@@ -218,7 +220,11 @@ def states(machine: Machine, frame: pd.DataFrame) -> tuple[Any, Any]:
 
 
 def ahead(
-    machine: Machine, frame: pd.DataFrame, period: float, values: Mapping[str, float], horizon: float
+    machine: Machine,
+    frame: pd.DataFrame,
+    period: float,
+    values: Mapping[str, float],
+    horizon: float,
 ) -> Any:
     """Predict windows that do not overlap by the engine; errors of the angles [rad], shape (n,)."""
     measured, commands = states(machine, frame)
@@ -332,7 +338,9 @@ def summary(errors: Any) -> dict[str, Any]:
     return {**found, "quantile": np.quantile(errors, 0.9), "windows": len(errors)}
 
 
-def fitted(machine: Machine, frame: pd.DataFrame, period: float, before: Mapping[str, float]) -> Any:
+def fitted(
+    machine: Machine, frame: pd.DataFrame, period: float, before: Mapping[str, float]
+) -> Any:
     """Fit the model to a recording, with what is known of the machine."""
     with machine.open(period) as world:
         given = world.given(dict(before)) if before else world
@@ -390,7 +398,9 @@ def show(name: str, pair: Pair, found: Mapping[str, Any]) -> None:
         print(f"  {remark}")
     print("  independent:", {k: round(v, 4) for k, v in found["independent"].items()})
     for horizon, row in found["errors"].items():
-        cells = (f"{k} {v['median']:.3f} ({v['quantile']:.2f})" for k, v in row.items() if k != "ratio")
+        cells = (
+            f"{k} {v['median']:.3f} ({v['quantile']:.2f})" for k, v in row.items() if k != "ratio"
+        )
         print(f"  {horizon:>4} s  {'  '.join(cells)}  ratio {row['ratio']:.2f}")
 
 
