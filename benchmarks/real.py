@@ -92,8 +92,7 @@ def two_links(v: Mapping[str, float], q: Any, u: Any) -> Any:
         Spong, Hutchinson and Vidyasagar, *Robot Modeling and Control*, 2020, section 6.4: the
         planar elbow manipulator, with the second angle relative to the first.
     """
-    m1, m2, c1, c2 = v["upper.mass"], v["lower.mass"], 0.2, -v["lower.center[2]"]
-    small = 0.0001
+    m1, m2, c1, c2, small = v["upper.mass"], v["lower.mass"], 0.2, 0.25, 0.0001
     both = m2 * 0.2 * c2 * np.cos(q[:, 1])
     a22 = m2 * c2**2 + small
     a12 = a22 + both
@@ -359,9 +358,9 @@ def predict(pair: Pair, folder: Path) -> dict[str, Any]:
     fit = fitted(machine, source, clock, pair.before)
     seconds = time.process_time() - begun
     with machine.open(clock) as world:
-        names = {*machine.fitted, *pair.before, *pair.do, "lower.center[2]", "weight.mass"}
+        names = {*machine.fitted, *pair.before, *pair.do, "weight.mass"}
         world.reset(seed=0)
-        usual = {**world.values(), "lower.center[2]": -0.25}
+        usual = world.values()
         file = {name: float(usual[name]) for name in names if name in usual}
     known = {**file, **pair.before}
     again = fitted(machine, target[target["time"] < pair.until], period, {**pair.before, **pair.do})

@@ -237,7 +237,7 @@ class Scenes(ABC):
         raise EngineFailure(NO_DEVICE, getattr(self, "name", type(self).__name__))
 
     def resident(self, which: Integers, copies: Counter[str]) -> Any:
-        """Let the states of scenes stay where the engine has them from step to step.
+        """Return what steps scenes whose states stay on the device of the engine.
 
         Args:
             which: The scenes, all that there are.

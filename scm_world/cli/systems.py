@@ -616,7 +616,9 @@ def fit(
     console.write(folder, {**files, "fit.png": png(found.picture()), "result.json": result})
     for path in save or ():
         found.save(path)
-        console.say(f"written: {path}")
+        late = ", ".join(t.name for t in found.targets if t.values is None)
+        lost = late if path.suffix not in (".yaml", ".yml", ".html") else ""
+        console.say(f"written: {path}" + f", which has no {lost}" * bool(lost))
     if failed is not None:
         raise failed
     raise typer.Exit(int(not found.explains))

@@ -61,7 +61,7 @@ class Response(NamedTuple):
 
 
 @dataclass(eq=False)
-class Asked:
+class AskedRange:
     """A range that is asked about, in one world.
 
     Attributes:
@@ -161,12 +161,12 @@ class Asking:
             raise UnknownOption(f"range of {name}", given, ("one in which low is below high",))
         return Box(*(end.ravel().tolist() if shape else float(end) for end in (low, high)))
 
-    def value(self, one: Asked, u: float) -> Floats:
+    def value(self, one: AskedRange, u: float) -> Floats:
         """Return the value at a place in a range, from 0 to 1, given the values of its world."""
         values = self.worlds.values(one.world) if one.space.parents() else {}
         return at(one.space, u, self.read(one.name).shape[1:], values)
 
-    def ends(self, one: Asked) -> tuple[Floats, Floats]:
+    def ends(self, one: AskedRange) -> tuple[Floats, Floats]:
         """Return both ends of a range."""
         return self.value(one, 0.0), self.value(one, TARGETS[0])
 
@@ -180,7 +180,7 @@ class Asking:
         """Set a parameter in some worlds; all have a value in ``values``."""
         self.worlds.set(name, values, self.all if mask is None else mask)
 
-    def only(self, one: Asked) -> Mask:
+    def only(self, one: AskedRange) -> Mask:
         """Return the mask of the world of a range."""
         return np.asarray(np.arange(self.n) == one.world)
 
@@ -244,7 +244,7 @@ class Asking:
         sizes = far.max(axis=(0, 1))
         return Response(float(share.max()), float(sizes[column]), column, step)
 
-    def response(self, run: PairedRun, base: PairedRun, one: Asked) -> Response | None:
+    def response(self, run: PairedRun, base: PairedRun, one: AskedRange) -> Response | None:
         """Compare runs in the world of a range.
 
         Where bodies that do not touch move one another, only the first step can tell.
@@ -291,7 +291,7 @@ class Asking:
         for names in (spaces.keys() - idle, idle):
             if names is idle:
                 self.actions, self._base = actions[:0], None
-            waiting = [Asked(name, space) for name, space in spaces.items() if name in names]
+            waiting = [AskedRange(name, space) for name, space in spaces.items() if name in names]
             while waiting:
                 alone = waiting[0].alone
                 group = waiting[: 1 if alone else max(1, self.n - 1)]
@@ -302,7 +302,7 @@ class Asking:
                 tell(len(found))
         return found
 
-    def _ask(self, group: list[Asked], tries: int) -> dict[str, dict[str, Answer]]:
+    def _ask(self, group: list[AskedRange], tries: int) -> dict[str, dict[str, Answer]]:
         """Ask about ranges, each in a world of its own. Those without an answer are asked again."""
         alone, base = len(group) == 1, self._base or self.run()
         found, last = self._choose(group, tries)
@@ -343,15 +343,15 @@ class Asking:
         return found | ({} if faulty and not alone else answers)
 
     def _choose(
-        self, group: list[Asked], tries: int
-    ) -> tuple[dict[str, dict[str, Answer]], set[Asked]]:
+        self, group: list[AskedRange], tries: int
+    ) -> tuple[dict[str, dict[str, Answer]], set[AskedRange]]:
         """Choose a value of each range: one that its world takes, and another one each time.
 
         Returned are all answers about ranges without such a value, and those of which no other one
         is tried.
         """
         found: dict[str, dict[str, Answer]] = {}
-        taken, why = dict.fromkeys(group, 0), dict[Asked, str]()
+        taken, why = dict.fromkeys(group, 0), dict[AskedRange, str]()
         self.worlds.reset(self.seed, self.all)
         for world, one in enumerate(group):
             one.world, one.before, one.seen = world, self.read(one.name), []
@@ -382,7 +382,7 @@ class Asking:
         last = {one for one in group if one.attempt and taken[one] <= one.attempt}
         return found, last | {one for one in group if one.attempt + 1 >= tries}
 
-    def _act(self, ranges: Iterable[Asked], back: Collection[Asked] = ()) -> None:
+    def _act(self, ranges: Iterable[AskedRange], back: Collection[AskedRange] = ()) -> None:
         """Set the value of each range in its world; set some back again."""
         for one in ranges:
             before = self.read(one.name)
@@ -394,7 +394,7 @@ class Asking:
                 except InterventionError as error:
                     one.stuck = f"the old value is refused: {error}"
 
-    def _set_back(self, ranges: Iterable[Asked]) -> None:
+    def _set_back(self, ranges: Iterable[AskedRange]) -> None:
         """Set the old values, and begin episodes: some worlds take values over only then."""
         self.worlds.reset(self.seed, self.all)
         for one in ranges:
@@ -404,9 +404,9 @@ class Asking:
 
     def _answers(
         self,
-        group: list[Asked],
-        asked: list[Asked],
-        back: Collection[Asked],
+        group: list[AskedRange],
+        asked: list[AskedRange],
+        back: Collection[AskedRange],
         base: PairedRun,
         first: PairedRun,
         again: PairedRun,
@@ -451,7 +451,7 @@ class Asking:
             here["constants"] = self._constants(*stale[one], first, act)
         return found
 
-    def _applied(self, one: Asked) -> Answer:
+    def _applied(self, one: AskedRange) -> Answer:
         got, before, wanted = (x[one.world] for x in (one.seen[0][1], one.before, one.values))
         if not np.array_equal(got, before):
             return Answer(status="passed")
@@ -460,14 +460,14 @@ class Asking:
         said = f"{numbers(wanted)} was set, and the engine still has {numbers(before)}"
         return Answer(status="fault", said=said)
 
-    def _undone(self, one: Asked, left: Response | None) -> Answer:
+    def _undone(self, one: AskedRange, left: Response | None) -> Answer:
         if one.late or one.stuck:
             return missing(one.stuck or "it acts only after the next reset")
         if left is not None and one.gap is not None and left.share <= UNDONE * one.gap.share:
             return Answer(status="passed", **self.said(left, "rounding is left"))
         return self._equality(left, "the old value leaves an effect")
 
-    def _taken(self, asked: list[Asked]) -> dict[Asked, Answer]:
+    def _taken(self, asked: list[AskedRange]) -> dict[AskedRange, Answer]:
         """Set both ends of ranges, and read them back."""
         found = dict.fromkeys(asked, missing("both ends were refused"))
         for u in (0.0, TARGETS[0]):
@@ -493,7 +493,7 @@ class Asking:
                     found[one] = Answer(status="passed")
         return found
 
-    def _is_alike(self, one: Asked, got: Floats, pose: Floats) -> bool:
+    def _is_alike(self, one: AskedRange, got: Floats, pose: Floats) -> bool:
         """Return whether other coordinates are of the same pose: a centre has no polar angle."""
         target = self.worlds.target(one.name)
         if target == one.name:
@@ -503,7 +503,7 @@ class Asking:
         return near(self.read(target)[one.world], pose[one.world], READ_BACK)
 
     def _flat(
-        self, asked: list[Asked], high: PairedRun | None, first: Callable[[], object] = int
+        self, asked: list[AskedRange], high: PairedRun | None, first: Callable[[], object] = int
     ) -> dict[str, str]:
         """Return between which ends and the middle of ranges no state differs, by name.
 
@@ -528,7 +528,7 @@ class Asking:
                         if one in left:
                             left.remove(one)
 
-            seen = set[Asked]()
+            seen = set[AskedRange]()
 
             def until(step: int, states: Floats) -> bool:
                 if other is None:
@@ -556,7 +556,7 @@ class Asking:
                 break
         return found
 
-    def _responses(self, one: Asked) -> dict[str, Answer]:
+    def _responses(self, one: AskedRange) -> dict[str, Answer]:
         """Answer whether the state responds, and when."""
         gap = one.gap
         if gap is not None:
@@ -578,7 +578,7 @@ class Asking:
         answer = missing(why) if why else Answer(status="fault", said=said)
         return {"responds": answer, "at once": missing("nothing responds")}
 
-    def _neighbours(self, one: Asked, run: PairedRun, base: PairedRun, others: Mask) -> Answer:
+    def _neighbours(self, one: AskedRange, run: PairedRun, base: PairedRun, others: Mask) -> Answer:
         if self.n == 1:
             return missing("there is one world")
         before, got = one.seen[0]
@@ -588,7 +588,7 @@ class Asking:
             return Answer(status="fault", said=said)
         return self._equality(self.gap(run, base, others), "the states of other worlds differ")
 
-    def _repeated(self, one: Asked, gap: Response | None) -> Answer:
+    def _repeated(self, one: AskedRange, gap: Response | None) -> Answer:
         before, wanted = one.before[one.world], one.values[one.world]
         if not (near(one.later, before) or near(one.later, wanted)):
             return Answer(status="fault", said=f"after the next reset it is {numbers(one.later)}")
@@ -665,7 +665,7 @@ class Asking:
 
     def drawn(self, name: str, space: Distribution) -> dict[str, Answer]:
         """Answer all questions about values that are drawn at resets."""
-        one, draws, seeds = Asked(name, space), self.worlds.draws, range(1, self.resets + 1)
+        one, draws, seeds = AskedRange(name, space), self.worlds.draws, range(1, self.resets + 1)
         values = np.array([self._after(self.seed + OTHER * i, name) for i in seeds])
         ends = self.ends(one)
         found = judge(values.reshape(self.resets, self.n, -1), *map(np.ravel, ends), draws=draws)
@@ -714,7 +714,7 @@ class Asking:
         self.worlds.reset(seed, self.all)
         return self.read(name)
 
-    def _first_observation(self, one: Asked) -> Answer:
+    def _first_observation(self, one: AskedRange) -> Answer:
         """Answer whether the first observation is of the values that were drawn."""
         self.worlds.reset(self.seed, self.all)
         old = self.worlds.outdated()

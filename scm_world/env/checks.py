@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict
 from scm_world._arguments import typed, whole_number
 from scm_world.backends.checkable import Checkable
 from scm_world.env.answers import QUESTIONS, Answer, Status, is_pair, numbers
-from scm_world.env.asking import Asked, Asking
+from scm_world.env.asking import AskedRange, Asking
 from scm_world.env.batch import ScmWorldVectorEnv
 from scm_world.env.ours import OurWorlds
 from scm_world.errors import UnknownOption
@@ -242,7 +242,7 @@ def check(
             tell(len(answers))
     found = []
     for name, space in spaces.items():
-        low, high = (tuple(np.ravel(end).tolist()) for end in asked.ends(Asked(name, space)))
+        low, high = (tuple(np.ravel(end).tolist()) for end in asked.ends(AskedRange(name, space)))
         here = {question: answers[name][question] for question in QUESTIONS}
         unit = worlds.unit(name)
         found.append(RangeReport(name=name, low=low, high=high, unit=unit, answers=here))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple, final
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, final
 
 import numpy as np
 from gymnasium.vector import VectorEnv
@@ -225,7 +225,7 @@ class TensorEnvs:
             actions: Shape (n, n_actions), finite.
 
         Raises:
-            ModelError: A reward is not finite; the message names the environment.
+            ModelError, EngineFailure: A reward is not finite; the message names the environment.
         """
         torch, rows, table = self._torch, self._rows, self._rows.table
         given, how = actions.to(table.device, torch.float64), self._actions
@@ -266,8 +266,8 @@ class TensorEnvs:
             last, facts = self.seen[ended].clone(), self._over(ended, {*reasons})
         return TensorStep(self.seen, rewards, terminated, truncated, ended, last, facts)
 
-    def _refuse(self, wrong: Integers) -> None:
-        """Raise the error of a reward that is not a number."""
+    def _refuse(self, wrong: Integers) -> NoReturn:
+        """Raise the error of a reward that is not finite."""
         self.leave()
         row = int(wrong[0])
         env = self._envs._inner[row]
@@ -275,6 +275,8 @@ class TensorEnvs:
             one_number(env._look(), REWARD, env.world.task.weights)
         except ScmWorldError as error:
             raise located(error, row, "environment") from error.__cause__
+        said = f"{REWARD} is finite on the host, and not on the device; step on the host"
+        raise located(EngineFailure(said, env.world.backend.name), row, "environment")
 
     def _over(self, ended: Integers, failed: set[int]) -> dict[str, Any]:
         """Begin the next episode where one is over; return what came of it."""
@@ -314,7 +316,7 @@ class TensorEnvs:
         self._look(rows)
 
     def leave(self) -> None:
-        """Let the environments go on from here by themselves."""
+        """Write everything back into the environments, which can be stepped again."""
         if len(there := np.setdiff1d(self._all, self._host_has)):
             self._to_host(there)
         self._envs._read_alone(self._all)

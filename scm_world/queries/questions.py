@@ -35,7 +35,7 @@ from scm_world.queries.samples import (
     refuse_late,
     usual_outcomes,
 )
-from scm_world.queries.together import Episodes
+from scm_world.queries.together import EpisodeBatch
 from scm_world.queries.twins import Twins, asked
 from scm_world.variables import Variable
 from scm_world.world import CausalSystem, CompiledModel, Equations
@@ -195,11 +195,11 @@ class Questions:
 
         done = count(1)
 
-        def outcomes_of(episodes: Episodes) -> Iterator[tuple[Floats, ...]]:
+        def outcomes_of(episodes: EpisodeBatch) -> Iterator[tuple[Floats, ...]]:
             of_each = [read_each(one, episodes) for one in wanted]  # may be empty
             return zip(*of_each, strict=True) if of_each else repeat((), len(episodes))
 
-        def finish(episodes: Episodes) -> Iterator[tuple[Floats, ...]]:
+        def finish(episodes: EpisodeBatch) -> Iterator[tuple[Floats, ...]]:
             for row in outcomes_of(episodes):
                 yield row
                 if progress is not None:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from scm_world.policies.scripted import AnyPolicy
-    from scm_world.queries.together import Episodes
+    from scm_world.queries.together import EpisodeBatch
     from scm_world.world.compiled_task import Vectors
 
 CONFIDENCE = 0.95
@@ -73,7 +73,7 @@ class Outcome(Frozen):
         decided = self.name in episode.eras[0].compiled.decided
         return np.asarray(self._of_many(np.asarray(episode[self.name])[None], decided)[0])
 
-    def of_each(self, episodes: Episodes) -> Floats:
+    def of_each(self, episodes: EpisodeBatch) -> Floats:
         """Compute the outcome of episodes that are read together, shape (n, ...)."""
         compiled = episodes.compiled
         return self._of_many(episodes.read(self.name), self.name in compiled.decided)
@@ -163,7 +163,7 @@ def read(outcome: Outcome | Function, episode: Episode) -> Floats:
     return as_numbers(value, outcome)
 
 
-def read_each(outcome: Outcome | Function, episodes: Episodes) -> Iterable[Floats]:
+def read_each(outcome: Outcome | Function, episodes: EpisodeBatch) -> Iterable[Floats]:
     """Compute an outcome of episodes that are read together, as finite numbers of each."""
     if not isinstance(outcome, Outcome):
         return [read(outcome, episode) for episode in episodes]

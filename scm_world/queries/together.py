@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 @final
-class Episodes(Sequence[Episode]):
+class EpisodeBatch(Sequence[Episode]):
     """Finished episodes of equal length, read as arrays with a leading axis, or one by one.
 
     Args:
@@ -46,7 +46,7 @@ class Episodes(Sequence[Episode]):
         self._acted, self._audits = acted or {}, audits or {}
 
     @classmethod
-    def of(cls, episode: Episode) -> Episodes:
+    def of(cls, episode: Episode) -> EpisodeBatch:
         """Return an episode that ran alone."""
         made = cls([episode.unit], episode)
         made._one = True
@@ -106,7 +106,7 @@ class Episodes(Sequence[Episode]):
         return found
 
 
-Result = tuple[Sequence[int], Episodes | Exception]
+Result = tuple[Sequence[int], EpisodeBatch | Exception]
 """Places of units, and their episodes, or the exception that stopped one of them."""
 
 
@@ -270,12 +270,12 @@ class _Together:
             yield [places[row]], self._errors[row]
         for row, (place, one) in self._rows.items():
             if row not in self._errors:
-                yield [place], Episodes.of(one._ended())
+                yield [place], EpisodeBatch.of(one._ended())
         kept = [row for row in range(len(self._shared)) if row not in self._errors]
         if kept:
             units = [self._units[row] for row in kept]
             which = None if len(kept) == len(self._shared) else np.array(kept)
-            many = Episodes(units, self._many, self._acted, self._audits, which)
+            many = EpisodeBatch(units, self._many, self._acted, self._audits, which)
             yield [self._shared[row] for row in kept], many
 
     def _alone(self, row: int, step: int) -> None:

@@ -22,7 +22,7 @@ from scm_world.errors import EngineFailure, ScmWorldError, UnknownOption
 from scm_world.graph import SCM
 from scm_world.policies.scripted import OpenLoopPolicy, as_policy
 from scm_world.queries.episodes import Episode, Era, Unit
-from scm_world.queries.together import Episodes, Result, is_known, run_together
+from scm_world.queries.together import EpisodeBatch, Result, is_known, run_together
 from scm_world.runs.processes import cores
 from scm_world.world import CausalSystem, CompiledModel, Equations, Simulation
 from scm_world.world.batch import Batch
@@ -127,7 +127,7 @@ class Twins:
     def run(
         self,
         units: Sequence[Unit],
-        finish: Callable[[Episodes], Iterable[Any]],
+        finish: Callable[[EpisodeBatch], Iterable[Any]],
         workers: int | None = None,
         catch: type[Exception] | tuple[type[Exception], ...] = (),
     ) -> list[Any]:
@@ -166,7 +166,7 @@ class Twins:
         units: Sequence[Unit],
         what: Any,
         found: Sequence[Floats],
-        read: Callable[[Episodes], Iterable[Sequence[Floats]]],
+        read: Callable[[EpisodeBatch], Iterable[Sequence[Floats]]],
         workers: int | None,
     ) -> list[Floats]:
         """Return how far apart equal runs are, at most, in each number that is read of an episode.
@@ -205,9 +205,9 @@ class Twins:
         with self.twin() as system:
             return unit.run(system, self)
 
-    def _alone(self, unit: Unit) -> Episodes | Exception:
+    def _alone(self, unit: Unit) -> EpisodeBatch | Exception:
         try:
-            return Episodes.of(self.episode(unit))
+            return EpisodeBatch.of(self.episode(unit))
         except Exception as error:
             return error
 
@@ -241,7 +241,7 @@ class Twins:
                     parts = [([place], self._alone(unit)) for place, unit in enumerate(some)]
                     alike = all(isinstance(result, EngineFailure) for _, result in parts)
                     if alike and isinstance(error, EngineFailure) and not error.lost:
-                        raise  # it is of the engine as such, which has been asked again since
+                        raise  # the first failure has the cause, such as a kept memory
                 for places, result in parts:
                     yield [here[place] for place in places], result
 
@@ -287,7 +287,7 @@ class Twins:
             how["policy"] = lambda it, taken=actions[rows]: taken[:, it.index]
             episode = replace(mine[0], **how).run(Equations(compiled, len(rows)), self)
             episode.eras = [Era(0, compiled, {})]
-            found.append((rows, Episodes(mine, episode)))
+            found.append((rows, EpisodeBatch(mine, episode)))
         return found
 
 

@@ -320,7 +320,7 @@ class GraphReport(Report):
         ]
 
     def rounded(self) -> list[Row]:
-        """Say which changes are no effects, on an engine that computes with fewer than 64 bits."""
+        """Return a row on the changes that do not count, if the engine has fewer than 64 bits."""
         if not self.rounding:
             return []
         name, size = max(self.rounding.items(), key=lambda item: item[1])

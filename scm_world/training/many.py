@@ -174,7 +174,7 @@ class ManyPpo:
         return self._seen(self._worlds.seen)
 
     def _stay_or_leave(self) -> None:
-        """Let control steps be computed on the host from now on, if the device cannot."""
+        """Compute control steps on the host from now on, if the device cannot."""
         if self._worlds.why_not:
             self.news.append(f"control steps are computed on the host: {self._worlds.why_not}")
             self._worlds.leave()

@@ -31,7 +31,7 @@ def test_equations_of_two_links_are_those_of_the_engine() -> None:
     """At random states and torques, without friction."""
     rng = np.random.default_rng(0)
     state, torque = rng.normal(size=(20, 4)), rng.uniform(-1.0, 1.0, (20, 2))
-    values = {"upper.mass": 0.6, "lower.mass": 0.5, "lower.center[2]": -0.25}
+    values = {"upper.mass": 0.6, "lower.mass": 0.5}
     names = [f"{joint}.{kind}" for joint in ("shoulder", "elbow") for kind in FRICTION]
     values |= dict.fromkeys([*names, "shoulder.armature", "elbow.armature"], 0.0)
     found = two_links(values, state, torque)

@@ -140,9 +140,10 @@ def test_a_urdf_is_written_by_the_command(tmp_path: Path, monkeypatch: Any) -> N
     pd.DataFrame(found).to_csv("run.csv", index=False)
     words = ["fit", "arm.urdf", "run.csv", "--parameters", "hinge.damping", "--noise"]
     words += ["hinge.position=0.001", "--parameters", "pole.mass", "--out", "out"]
-    words += ["--option", "fixed_base=true", "--save", "fitted.urdf"]
+    words += ["--option", "fixed_base=true", "--save", "fitted.urdf", "--parameters", "delay"]
     done = CliRunner().invoke(app, words, catch_exceptions=False)
     assert done.exit_code == 0, done.output
+    assert "written: fitted.urdf, which has no delay" in done.output
     assert "<!-- from the data sheet -->" in Path("fitted.urdf").read_text()
     fitted = sw.World("fitted.urdf", fixed_base=True)
     fitted.reset(seed=0)

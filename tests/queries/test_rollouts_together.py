@@ -26,7 +26,7 @@ from scm_world.queries import Outcome, World
 from scm_world.queries import twins as parallel
 from scm_world.queries.episodes import Episode, Unit
 from scm_world.queries.samples import Setting
-from scm_world.queries.together import Episodes, is_known, run_together
+from scm_world.queries.together import EpisodeBatch, is_known, run_together
 from scm_world.queries.twins import Twins, twins_of
 from scm_world.variables import (
     Contact,
@@ -186,7 +186,7 @@ def test_rows_of_one_plan_are_those_alone(backend: str, n: int) -> None:
             assert_same(one, other)
     names = ("reward", "tool_block.cartesian_position", "floor_friction", "action")
 
-    def read(episodes: Episodes) -> Any:
+    def read(episodes: EpisodeBatch) -> Any:
         assert len({len(episodes), len(episodes.vectors), len(episodes.units)}) == 1
         return zip(*(episodes.read(name) for name in names), strict=True)
 

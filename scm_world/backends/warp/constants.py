@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import Floats
-from scm_world.backends.mujoco.realization import Realization
+from scm_world.backends.mujoco.realization import OF_DATA, Realization
 from scm_world.backends.warp.device import STATIC, batched_names, put
 from scm_world.errors import NotIntervenable
 from scm_world.geometry.numbers import njit
@@ -31,8 +31,6 @@ from scm_world.models.scene import ParameterKey, Parameters
 
 OPTIONS = "gravity", "wind", "magnetic", "timestep", "density", "viscosity", "impratio_invsqrt"
 """Options that worlds can differ in, as the device calls them."""
-OF_DATA = "xfrc_applied", "mocap_pos", "mocap_quat", "eq_active"
-"""Parameters that MuJoCo keeps with the state."""
 MOVES = frozenset({"body_pos", "body_quat", "geom_pos", "geom_quat"})
 UNUSED = frozenset({"eq_active0", "dof_length"})
 """Arrays that the device has once for all worlds, and reads only in a reset or for sleep."""

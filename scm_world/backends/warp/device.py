@@ -91,7 +91,7 @@ class _CompilerMessages:
                 self.close()
 
     def close(self) -> None:
-        """Say how many there are by now."""
+        """Print how many there are by now."""
         if self._count:
             seconds = time.monotonic() - self._start
             sys.stderr.write(f"  {self._count} of about 40 modules in {seconds:.0f} s\n")

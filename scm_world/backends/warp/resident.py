@@ -140,6 +140,6 @@ class Resident:
         return reasons
 
     def _wait(self) -> None:
-        """Let Warp and torch, which have queues of their own on a GPU, not overtake one another."""
+        """Wait for Warp and torch, which have separate queues on a GPU."""
         if self.device != "cpu":
             torch.cuda.synchronize(self.device)

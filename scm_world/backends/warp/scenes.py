@@ -315,7 +315,7 @@ class Group:
         return array.numpy() if array.device.is_cpu else array
 
     def resident(self, slots: Integers, copies: Counter[str]) -> Any:
-        """Let the states of scenes that follow one another, and are all there are, stay there."""
+        """Return what steps all scenes on the device; they follow one another."""
         from scm_world.backends.warp.resident import Resident  # needs torch
 
         if (np.diff(slots) != 1).any():
@@ -667,7 +667,7 @@ class WarpScenes(Scenes):
         return groups[0][0].tensor(groups[0][2], name)
 
     def resident(self, which: Integers, copies: Counter[str]) -> Any:
-        """Let the states of scenes stay on the device from step to step; see ``Resident``."""
+        """Return what steps scenes whose states stay on the device; see ``Resident``."""
         groups = self._grouped(which)
         if len(groups) > 1:
             raise EngineFailure("the worlds have different structures", self.name)

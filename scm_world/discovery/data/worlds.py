@@ -37,7 +37,7 @@ from scm_world.queries.identification import in_force
 from scm_world.queries.local import contact_terms
 from scm_world.queries.plans import Plan
 from scm_world.queries.samples import Outcome, Setting, named_outcomes
-from scm_world.queries.together import Episodes
+from scm_world.queries.together import EpisodeBatch
 from scm_world.queries.twins import asked
 from scm_world.variables import Normal
 from scm_world.variables.reserved import SENSOR_NOISE
@@ -231,7 +231,7 @@ class EpisodeRows:
         refused: dict[str, str] = {}
         touching: dict[str, Any] = {}
 
-        def finish(ran: Episodes) -> Iterator[Any]:
+        def finish(ran: EpisodeBatch) -> Iterator[Any]:
             looks = map(self._look, ran) if self._pictures else repeat([])
             both = map(_touched, ran) if self._contacts else repeat(None)
             return zip(self._values(ran), looks, both, strict=False)
@@ -279,7 +279,7 @@ class EpisodeRows:
         there = reached(model, names, self.columns, first=whole)
         return tuple(n for n in there if whole or step == 0 or not is_state(model, n))
 
-    def _values(self, episodes: Episodes) -> Floats:
+    def _values(self, episodes: EpisodeBatch) -> Floats:
         """Return the rows of each episode, shape (n, rows, p)."""
         n, last = len(episodes), episodes.steps
         if self._pure and self._every_step:  # the first step reads the first instant
@@ -300,7 +300,7 @@ class EpisodeRows:
                 )
         return np.concatenate(values, axis=2)
 
-    def _sensed(self, episodes: Episodes, name: str, steps: Iterable[int]) -> Floats:
+    def _sensed(self, episodes: EpisodeBatch, name: str, steps: Iterable[int]) -> Floats:
         """Return a variable at every instant, with sensor noise at some instants."""
         values, half = episodes.read(name).astype(np.float64), self._half.get(name)
         if half is None or not half.any():

@@ -204,6 +204,16 @@ def test_a_reward_that_is_not_a_number_is_refused() -> None:
         there.step(torch.zeros((N, 9)))
 
 
+def test_a_reward_that_is_finite_on_the_host_alone_is_refused() -> None:
+    """It is not taken for a reward, and not passed over."""
+    envs = _vector("reaching")
+    envs.reset(seed=0)
+    there = TensorEnvs(envs)
+    there._scale = float("nan")
+    with pytest.raises(EngineFailure, match=r"environment 0: .*finite on the host"):
+        there.step(torch.zeros((N, 9)))
+
+
 @pytest.mark.parametrize("task", ["reaching", "pushing"])
 def test_a_step_copies_what_is_stated_and_nothing_else(
     task: str, monkeypatch: pytest.MonkeyPatch
