@@ -244,6 +244,9 @@ def test_whole_batches_are_single_episodes(monkeypatch: pytest.MonkeyPatch, most
         assert [len(np.unique(part.episode)) <= shard for part in parts] == [True] * len(parts)
         whole = Dataset.joined([replace(part, about={}) for part in parts])
         assert whole == replace(found, about={})
+        assert found.truth is not None and all(part.truth == found.truth for part in parts)
+        listed = [number for part in parts for number in part.about.get("refused", ())]
+        assert sorted(listed, key=int) == sorted(refused, key=int)
 
 
 def test_instants_have_the_action_of_their_step(world: World) -> None:
