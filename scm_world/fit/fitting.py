@@ -40,6 +40,7 @@ from scm_world.fit.result import DETERMINED, Fit
 from scm_world.fit.search import SAME, SEARCHES, Minima, Result, gauss_newton
 from scm_world.fit.shooting import Shooting
 from scm_world.fit.targets import Target, acting, targets_of, twin_of
+from scm_world.fit.thinning import thinned
 from scm_world.fit.units import check_units, reading_of
 from scm_world.queries.progress import Progress
 from scm_world.queries.world import World
@@ -70,12 +71,13 @@ def fit(
     columns: Mapping[str, str] | None = None,
     ignore: Iterable[str] = (),
     symmetric: bool = False,
+    thin: int | None = None,
     progress: Progress | None = None,
     search: Search = gauss_newton,
 ) -> Fit:
     """Fit parameters to a recording with any search; see ``World.fit`` and ``Search``."""
     world = world.for_fit(recording)
-    how = window, begins, Reading(setups, columns, ignore), symmetric
+    how = window, begins, Reading(setups, columns, ignore), symmetric, thin
     measured, targets = arguments_of(world, recording, as_names(parameters), *how)
     measured, later = (measured, None) if held_out is None else parted(measured, held_out)
     count, number = len(measured.cells[0]), len(targets)
@@ -100,7 +102,8 @@ def fit(
                     break
                 outliers += new
                 minima = Minima(minima.problem.without(new), search)
-                first, measured = minima.found(range(number)), minima.problem.measured
+                first = minima.found(range(number), first)
+                measured = minima.problem.measured
             searched[rows] = first
             if first.joined or attempt == len(usual):
                 found = fitted(minima, range(number), first, progress)
@@ -119,10 +122,13 @@ def arguments_of(
     begins: Begins = None,
     reading: Reading | None = None,
     symmetric: bool = False,
+    thin: int | None = None,
 ) -> tuple[Measurements, tuple[Target, ...]]:
     """Check and read the arguments of a fit; all parameters that act on a measurement if None."""
     if window is not None:
         whole_number("window", window, least=2)
+    if thin is not None:
+        whole_number("thin", thin, least=1)
     if getattr(world.composition.commands, "_drawn", None):
         problem = "the step function draws noise in each step, which a recording does not contain"
         raise ModelError([f"{problem}: leave noise= out, and the residuals have it"])
@@ -134,7 +140,7 @@ def arguments_of(
         asked = acting(twin, measured.columns) if parameters is None else parameters
         targets = targets_of(twin, asked, symmetric=symmetric)
         check_units(world, measured)
-        measured = begun(twin, measured, begins)
+        measured = begun(twin, thinned(measured, thin), begins)
     if any(target.values is not None and not target.values.any() for target in targets):
         with Shooting(world, measured, targets) as shooting:
             targets = shooting.seen(windows_of(measured.runs, SHORT))

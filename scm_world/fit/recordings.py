@@ -153,12 +153,14 @@ class Measurements:
         columns: Their measured columns.
         control_dt: Length of a control step [s].
         begins: Standard deviations of the last columns, which are known where a run begins.
+        every: Every which row of the recording is among these; see ``thinned``.
     """
 
     runs: tuple[RecordedRun, ...]
     columns: tuple[MeasuredNumber, ...]
     control_dt: float
     begins: tuple[float, ...] = ()
+    every: int = 1
 
     @property
     def recorded(self) -> tuple[MeasuredNumber, ...]:

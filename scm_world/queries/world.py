@@ -460,6 +460,7 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         columns: Mapping[str, str] | None = None,
         ignore: Iterable[str] = (),
         symmetric: bool = False,
+        thin: int | None = None,
         progress: Progress | None = None,
         search: Search | None = None,
     ) -> Fit:
@@ -485,7 +486,7 @@ class World(Planned, _System, Questions, metaclass=_Opener):
                 proportions of their components unless these are named.
             noise: Standard deviations of the measurements: a number, or numbers by patterns of
                 columns; estimated from the residuals if None.
-            window: Number of rows of a window; if None 50, or 10 where only these explain the
+            window: Number of used rows of a window; if None 50, or 10 where only these explain the
                 recording, which is a remark then. Longer windows determine more, and shorter ones
                 bear more disturbances, contacts and chaos.
             begins: How the recording begins, where that was not measured: ``"rest"`` (velocities 0,
@@ -499,6 +500,9 @@ class World(Planned, _System, Questions, metaclass=_Opener):
             columns: Names of this world by those of the tables, ``{"torque": "motor.control"}``.
             ignore: Patterns of columns that are left out.
             symmetric: Whether ranges [-a, a], such as those of forces, stay symmetric.
+            thin: Every which row is used; 1 for all rows. If None, rows at high rates are thinned
+                as far as lines between the used ones pass the others within their noise and 0.3 %
+                of their spread, and 250 rows are left; a remark says so. Commands act as recorded.
             progress: Called after each round of estimating the noise.
             search: What finds the next minimum of least squares; ``gauss_newton`` if None. See
                 ``scm_world.fit.Search``.
@@ -522,7 +526,7 @@ class World(Planned, _System, Questions, metaclass=_Opener):
 
         options: dict[str, Any] = {"noise": noise, "window": window, "begins": begins}
         options |= {"held_out": held_out, "setups": setups, "progress": progress}
-        options |= {"symmetric": symmetric, "columns": columns, "ignore": ignore}
+        options |= {"symmetric": symmetric, "columns": columns, "ignore": ignore, "thin": thin}
         options |= {} if search is None else {"search": search}
         return fit(self, recording, parameters, **options)
 
@@ -539,6 +543,7 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         setups: Sequence[Mapping[str, object]] | None = None,
         columns: Mapping[str, str] | None = None,
         ignore: Iterable[str] = (),
+        thin: int | None = None,
         progress: Progress | None = None,
     ) -> Deviation:
         """Find which parameter accounts for the deviation of a recording from this world.
@@ -561,6 +566,7 @@ class World(Planned, _System, Questions, metaclass=_Opener):
             setups: See ``fit``.
             columns: See ``fit``.
             ignore: See ``fit``.
+            thin: See ``fit``.
             progress: Called after each fit.
 
         Raises:
@@ -574,7 +580,7 @@ class World(Planned, _System, Questions, metaclass=_Opener):
             "begins": begins,
             "setups": setups,
         }
-        options |= {"columns": columns, "ignore": ignore, "most": most}
+        options |= {"columns": columns, "ignore": ignore, "most": most, "thin": thin}
         return explain(self, recording, candidates, progress=progress, **options)
 
     def for_fit(self, recording: object) -> World:
