@@ -37,7 +37,7 @@ from scm_world.fit.recordings import (
     read_recording,
 )
 from scm_world.fit.result import DETERMINED, Fit
-from scm_world.fit.search import SAME, SEARCHES, Minima, Result, gauss_newton
+from scm_world.fit.search import SAME, SEARCHES, TINY, Minima, Result, gauss_newton
 from scm_world.fit.shooting import Shooting
 from scm_world.fit.targets import Target, acting, targets_of, twin_of
 from scm_world.fit.thinning import thinned
@@ -53,6 +53,7 @@ RIDGE = 30.0  # times the error with all others known, of a parameter that other
 PEELS = 3  # times that outliers are left out
 END = 0.1  # largest deviation of the root of the squares at an end of an interval, relative
 OPEN = 300.0  # scaled distance up to which an end is searched
+ALMOST = 0.01  # precision of the squares along a profile, in those at the end of an interval
 PROFILE = 8  # largest number of steps at the end of an interval
 LINEAR = 0.1  # largest deviation from the squares that linearised residuals have there, relative
 
@@ -164,9 +165,10 @@ def fitted(
         progress: Called after each search.
     """
     best = first or minima.found(active)
-    misfit = not described(minima, active, best).explains
+    found = described(minima, active, best)
+    about: dict[str, Any] = {"misfit": not found.explains, "discount": found.discount}
     for _ in range(BETTER):
-        best = minima.repeated(active, best, misfit=misfit, progress=progress)
+        best = minima.repeated(active, best, progress=progress, **about)
         found = described(minima, active, best)
         reach, lower = _profile(minima, best, [*active], found)
         if lower is None:
@@ -215,8 +217,9 @@ def _profile(
         limit = problem.high[i] - middle[i] if side else middle[i] - problem.low[i]
         along = (2 * side - 1) * spread[:, place] / spread[place, place]
         others = [j for j in active if j != i]
-        squares = LeastSquares(problem, problem.windows, best.noise, others, most=PROFILE)
         allowed = (linear[place] / found.errors[place]) ** 2 * found.discount
+        rough = ALMOST * allowed / max(found.squares, TINY)
+        squares = LeastSquares(problem, problem.windows, best.noise, others, rough, PROFILE)
         least = 0.0 if best.smooth or found.errors[place] > DETERMINED else linear[place]
         far = min(max(linear[place], STEP), PRIOR)
         near, below, ends, above = 0.0, 0.0, np.inf, np.inf  # distances, and roots of the squares

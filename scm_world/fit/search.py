@@ -174,10 +174,14 @@ class Result(NamedTuple):
     first: Minimum
     others: tuple[Floats, ...] = ()
 
-    def like(self, other: Result, active: Sequence[int]) -> bool:
-        """Return whether it is the same minimum of the active parameters as another one."""
-        far = np.abs(self.at.scaled - other.at.scaled)[[*active]] / other.at.errors
-        return abs(self.loss - other.loss) < SAME and bool((far < NEAR).all())
+    def like(self, other: Result, active: Sequence[int], discount: float = 1.0) -> bool:
+        """Return whether it is the same minimum of the active parameters as another one.
+
+        Correlated residuals increase the variance by a discount.
+        """
+        errors = other.at.errors * discount**0.5
+        far = np.abs(self.at.scaled - other.at.scaled)[[*active]] / errors
+        return abs(self.loss - other.loss) < SAME * discount and bool((far < NEAR).all())
 
 
 @final
@@ -256,6 +260,7 @@ class Minima:
         *,
         same: bool = False,
         misfit: bool = False,
+        discount: float = 1.0,
         progress: Progress | None = None,
     ) -> Result:
         """Repeat a search from other starts until the best minimum was found twice.
@@ -270,6 +275,7 @@ class Minima:
             same: Whether it was found again already.
             misfit: Whether a column has residuals that the noise does not explain: the searches
                 begin farther away.
+            discount: By how much correlated residuals increase the variance.
             progress: Called after each search.
         """
         rng, active, problem = np.random.default_rng(0), [*active], self.problem
@@ -290,10 +296,11 @@ class Minima:
             join = 2 + number % 2
             other = self._joined(active, scaled, starts, best.noise, join, True)
             every.append(other)
-            same = other.like(best, active) or (same and other.loss > best.loss)
+            same = other.like(best, active, discount) or (same and other.loss > best.loss)
             best = min(best, other, key=lambda one: one.loss)
-        good = [one for one in every if one.loss < best.loss + SAME and not one.like(best, active)]
-        return best._replace(others=tuple(one.at.scaled for one in good))
+        good = [one for one in every if one.loss < best.loss + SAME * discount]
+        apart = (one.at.scaled for one in good if not one.like(best, active, discount))
+        return best._replace(others=tuple(apart))
 
     def descended(self, active: Sequence[int], best: Result, other: Minimum) -> Result:
         """Return the minimum that is reached from the start states of other parameters' minimum.
