@@ -478,8 +478,9 @@ class World(Planned, _System, Questions, metaclass=_Opener):
                 time), a column for each command, held until the next row, and columns of any
                 states, readouts or outcomes in their units; vectors have columns ``name[i]``, and
                 NaN was not measured. A column ``episode`` separates runs, and so do a gap in time
-                and a command that is NaN. Or a ROS bag, a LeRobot dataset, an ``Episode``, a ``Dataset`` with every step, a dataset of Minari (with observations
-                and actions in units, not normalised), or a list of these.
+                and a command that is NaN. Or a ROS bag, a LeRobot dataset, an ``Episode``, a
+                ``Dataset`` with every step, a dataset of Minari (with observations and actions in
+                units, not normalised), or a list of these.
             parameters: Patterns of parameters, such as ``["*.damping", "upper_arm.mass"]``, or of
                 their components; ``"delay"`` is a delay of all commands. Inertias keep the
                 proportions of their components unless these are named.

@@ -475,7 +475,7 @@ def test_a_column_of_one_of_several_files_is_renamed(
     one, two = read_recording(world, ["one.csv", "two.csv"], how).runs
     np.testing.assert_allclose(one.values, two.values, rtol=1e-12)
     np.testing.assert_array_equal(one.commands, two.commands)
-    with pytest.raises(UnknownOption, match="column of the table .*'qq'"):
+    with pytest.raises(UnknownOption, match=r"column of the table .*'qq'"):
         read_recording(
             world, ["one.csv", "two.csv"], Reading(None, {**names, "qq": "time"}, how[2])
         )
