@@ -531,14 +531,16 @@ def fit(
 
     Args:
         recordings: Tables of text (with commas, semicolons or tabs), Parquet or npz files with the
-            time in seconds, every command, and any states or readouts; they are fitted together.
+            time in seconds, every command, and any states or readouts; ROS bags, or LeRobot
+            datasets; they are fitted together.
         parameters: Fitted parameter, such as '*.damping', upper_arm.mass or delay.
         noise: Standard deviation of a measurement; estimated by default.
         window: Used rows of a window, which begins in a fitted state; 0 for 50, or 10 where only
             these explain the recording.
         begins: How the recordings begin: 'rest', or a state with its standard deviation, such as
             '*.velocity=0,0.01'; fitted by default.
-        column: Name of this system for a column of the files, such as torque=motor.control.
+        column: Name of this system for a column of the files, such as torque=motor.control, if need
+            be with its unit, 'stamp=time [ms]'.
         ignore: Columns that are left out, such as 'temperature*'.
         setup: Value of a parameter that was set for a recording, such as 1:weight.mass=1.0; the
             first recording has the number 0.

@@ -475,12 +475,13 @@ class World(Planned, _System, Questions, metaclass=_Opener):
 
         Args:
             recording: A CSV, Parquet or npz file, a data frame or arrays by name, with ``time`` [s]
-                in whole control steps (to a quarter of one), a column for each command, held until
-                the next row, and columns of any states, readouts or outcomes in their units;
-                vectors have columns ``name[i]``, and NaN was not measured. A column ``episode``
-                separates runs, and so do a gap in time and a command that is NaN. Or an
-                ``Episode``, a ``Dataset`` with every step, a dataset of Minari (with observations
-                and actions in units, not normalised), or a list of these.
+                in whole control steps (to a quarter of one; rows that have commands alone at any
+                time), a column for each command, held until the next row, and columns of any
+                states, readouts or outcomes in their units; vectors have columns ``name[i]``, and
+                NaN was not measured. A column ``episode`` separates runs, and so do a gap in time
+                and a command that is NaN. Or a ROS bag, a LeRobot dataset, an ``Episode``, a
+                ``Dataset`` with every step, a dataset of Minari (with observations and actions in
+                units, not normalised), or a list of these.
             parameters: Patterns of parameters, such as ``["*.damping", "upper_arm.mass"]``, or of
                 their components; ``"delay"`` is a delay of all commands. Inertias keep the
                 proportions of their components unless these are named.
@@ -497,7 +498,8 @@ class World(Planned, _System, Questions, metaclass=_Opener):
             setups: The set-up of each of several recordings: values of parameters that were set for
                 it, ``[{}, {"weight.mass": 1.0}]``. A recording may carry its own: a column
                 ``do.weight.mass``, or arrays by name with ``"do": {"weight.mass": 1.0}``.
-            columns: Names of this world by those of the tables, ``{"torque": "motor.control"}``.
+            columns: Names of this world by those of the tables, ``{"torque": "motor.control"}``,
+                if need be with their units, ``{"stamp": "time [ms]"}``.
             ignore: Patterns of columns that are left out.
             symmetric: Whether ranges [-a, a], such as those of forces, stay symmetric.
             thin: Every which row is used; 1 for all rows. If None, rows at high rates are thinned
