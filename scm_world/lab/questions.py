@@ -270,7 +270,7 @@ def _graph(bench: Bench, rng: np.random.Generator) -> Made:
 
 def _grade_graph(answer: Any, question: Question) -> float:
     names, truth = list(question.bench.quantities), question.answer
-    given = _pairs(answer, "edges", names), _pairs(answer, "hidden", names)
+    given = graph_pairs(answer, "edges", names), graph_pairs(answer, "hidden", names)
     own = {tuple(edge) for edge in question.query["known"]}
     edges = [(c, e, 0) for c, e in given[0] if (c, e) not in own]
     true = [(c, e, 0) for c, e in truth["edges"]]
@@ -280,7 +280,7 @@ def _grade_graph(answer: Any, question: Question) -> float:
     return max(0.0, 1.0 - 2.0 * wrong / len(true))
 
 
-def _pairs(answer: Any, part: str, names: Sequence[str]) -> list[tuple[str, str]]:
+def graph_pairs(answer: Any, part: str, names: Sequence[str]) -> list[tuple[str, str]]:
     found: Any = answer.get(part, ()) if isinstance(answer, Mapping) else None
     right = isinstance(found, list | tuple) and len(found) <= len(names) ** 2
     if not right or not {*answer} <= {"edges", "hidden"}:
