@@ -20,9 +20,9 @@ def list_() -> None:
 
     Example: scm-world suite list
     """
-    from scm_world.lab.suites import suite, suites
+    from scm_world.lab.suites import SUITES, suite
 
-    found = [suite(name) for name in suites()]
+    found = [suite(name) for name in SUITES]
     rows = [
         {"suite": one.name, "parts": len(one.parts()), "about": one.manifest["title"]}
         for one in found
@@ -47,8 +47,11 @@ def make(name: Name, *, key: Path = None, out: options.Out = None, jobs: options
     with jobs.open("parts", folder, "*.parquet", "parts") as job:
         made = found.make(key=_secret(key), **job)
     rows = sum(part["rows"] for part in made.parts.values())
-    same = len(made.parts) - len(made.differ)
-    console.say(f"{name}: {len(made.parts)} parts, {rows} rows, {same} as in the manifest")
+    known = sum("sha256" in found.manifest["parts"][part] for part in made.parts)
+    console.say(
+        f"{name}: {len(made.parts)} parts, {rows} rows; the manifest has hashes of {known} parts, "
+        f"and {known - len(made.differ)} are the same"
+    )
     if made.differ:
         shown = ", ".join(made.differ[:SHOWN]) + ", …" * (len(made.differ) > SHOWN)
         other = "; ".join(made.versions) or "the versions are the same"

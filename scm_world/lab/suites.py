@@ -11,18 +11,19 @@ import hmac
 import io
 import json
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from importlib import resources
-from typing import TYPE_CHECKING, Any, NamedTuple, final
+from importlib import metadata, resources
+from typing import TYPE_CHECKING, Any, NamedTuple, cast, final
 
 from scm_world._arguments import one_of, typed
 from scm_world.discovery.data import Dataset, as_frame, as_huggingface, collect, load, save
 from scm_world.discovery.problems import TaskView, problem
 from scm_world.errors import ModelError, ScmWorldError, UnknownOption, reading
 from scm_world.evaluation.statistics import mean_interval
-from scm_world.lab.questions import LEVELS, PASSED, Question, graph_pairs, question
+from scm_world.lab.questions import LEVELS, PASSED, Question, check_key, graph_pairs, question
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
 from scm_world.runs.files import Location, is_there, located, read_bytes, write_whole
@@ -34,8 +35,9 @@ if TYPE_CHECKING:
     import pandas
 
 KIND = "suite"
+SUITES = ("lab-1", "physics-1")
+"""The names of all suites."""
 MANIFESTS = resources.files("scm_world.lab") / "manifests"
-SHORTEST = 16  # characters of a key
 ANSWER, CONFIDENCE, ID = "answer", "confidence", "question"
 """The columns of a file of answers."""
 ENDS = {"score": "value", "low": "low", "high": "high"}
@@ -46,7 +48,8 @@ def boxes() -> ModelTask:
     places = (0.0, 0.15, 3.0)  # [m]
     bodies = "".join(
         f'<body name="box{i}" pos="{x} 0 0.05"><joint name="box{i}" type="slide" axis="1 0 0" '
-        f'stiffness="2" damping="0.2"/><geom name="box{i}" type="box" size="0.05 0.05 0.05" mass="0.2"/></body>'
+        f'stiffness="2" damping="0.2"/><geom name="box{i}" type="box" size="0.05 0.05 0.05" '
+        f'mass="0.2"/></body>'
         for i, x in enumerate(places)
     )
     motors = "".join(
@@ -71,13 +74,8 @@ def suite(name: str) -> Suite:
         >>> suite("physics-1").manifest["parts"]["servo-5-paired"]["source"]
         'servo:5'
     """
-    one_of("suite", name, suites())
+    one_of("suite", name, SUITES)
     return Suite(name, json.loads((MANIFESTS / f"{name}.json").read_text()))
-
-
-def suites() -> tuple[str, ...]:
-    """Return the names of all suites."""
-    return tuple(sorted(one.name.removesuffix(".json") for one in MANIFESTS.iterdir()))
 
 
 class Made(NamedTuple):
@@ -148,9 +146,7 @@ class Suite:
 
     def parts(self, key: str | None = None) -> dict[str, dict[str, Any]]:
         """Return the recipes by the name of their part; those of private ones only with a key."""
-        if key is not None and len(key) < SHORTEST:
-            allowed = (f"at least {SHORTEST} characters that nobody can guess",)
-            raise UnknownOption("key", "…", allowed)
+        check_key(key)
         found = self.manifest["parts"].items()
         return {name: recipe for name, recipe in found if key or not recipe.get("private")}
 
@@ -167,10 +163,10 @@ class Suite:
         recipes = {name: _recipe(recipe) for name, recipe in self.manifest["parts"].items()}
         settings = {"suite": self.name, "recipes": recipes, "versions": _here()}
         cells = {f"{name}.json": (name, recipe) for name, recipe in parts.items()}
-        work = partial(_part, folder, key)
-        how = {"read": partial(_checked, folder, key), "write": _written, "progress": progress}
+        work, read = partial(_part, folder, key), partial(_checked, folder, key)
         with Study(folder, KIND, settings) as study, pool_of(engine, workers) as pool:
-            found = dict(study.map(cells, work, pool=pool, **how))
+            how: dict[str, Any] = {"pool": pool, "progress": progress}
+            found = dict(study.map(cells, work, read=read, write=_written, **how))
         return {name: found[f"{name}.json"] for name in parts}
 
     @typed
@@ -254,9 +250,7 @@ class Suite:
 
 def _here() -> dict[str, str]:
     """Return the versions on which the content of a suite depends."""
-    import mujoco
-
-    return versions(f"mujoco {mujoco.__version__}")
+    return versions(f"mujoco {metadata.version('mujoco')}")
 
 
 # --- parts ----------------------------------------------------------------------------------------
@@ -308,12 +302,12 @@ def _written(found: Mapping[str, Any]) -> bytes:
     return json.dumps(found).encode()
 
 
-def _checked(folder: Location, key: str | None, data: bytes) -> dict[str, Any]:
+def _checked(folder: Location | None, key: str | None, data: bytes) -> dict[str, Any]:
     """Read what is known of a part, and compare its data with it."""
     import pandas
 
     found: dict[str, Any] = json.loads(data)
-    name = found["part"]
+    folder, name = cast("Location", folder), found["part"]  # there is a file to read
     if found.get("key", _mark(key)) != _mark(key):
         raise ValueError("its questions are of another key")
     if "edges" in found:
@@ -427,15 +421,14 @@ def _answers(table: pandas.DataFrame, known: set[str]) -> dict[str, tuple[Any, A
         one_of("column of answers", column, [*table])
     found = dict[str, tuple[Any, Any]]()
     sure = table[CONFIDENCE] if CONFIDENCE in table else [None] * len(table)
-    for i, answer, confidence in zip(table[ID], table[ANSWER], sure, strict=True):
+    for i, given, confidence in zip(table[ID], table[ANSWER], sure, strict=True):
         one_of("question", i, sorted(known))
         if i in found:
             raise UnknownOption("question", i, ("one row for each question",))
-        if isinstance(answer, str):
-            try:
-                answer = json.loads(answer)
-            except ValueError:  # a law or a name without quotes
-                pass
+        answer = given
+        if isinstance(given, str):
+            with suppress(ValueError):  # a law or a name without quotes
+                answer = json.loads(given)
         found[i] = answer, confidence
     return found
 

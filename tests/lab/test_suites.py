@@ -15,7 +15,7 @@ from scm_world.cli.app import app
 from scm_world.discovery.data import load
 from scm_world.errors import UnknownOption, UnreadableFile
 from scm_world.lab import Question
-from scm_world.lab.suites import Suite, suite, suites
+from scm_world.lab.suites import SUITES, Suite, suite
 from scm_world.tasks.families import servo
 
 KEY = "a key of a test, of more than 16 characters"
@@ -162,15 +162,19 @@ def test_mlcroissant_reads_tables_and_questions(folder: Path) -> None:
     assert first[f"servo-5-paired/{table.names[0]}"] == pytest.approx(table.values[0, 0])
 
 
-@pytest.mark.parametrize("name", suites())
+@pytest.mark.parametrize("name", SUITES)
 def test_manifests_are_complete(name: str) -> None:
-    """Each part has a recipe, and each public one a hash; the card shows trivial answers."""
-    found = suite(name)
-    assert found.manifest["title"]
+    """Each part has a recipe, and those with a hash have trivial answers, too; all seeds differ."""
+    found, seeds = suite(name), set[int]()
     for part, recipe in found.parts("k" * 16).items():
         assert {"kind", "seed"} <= recipe.keys(), part
-        assert recipe.get("private") or len(recipe["sha256"]) == 64, part
-        assert recipe.get("private") or recipe["trivial"], part
+        assert "sha256" not in recipe or (len(recipe["sha256"]) == 64 and recipe["trivial"]), part
+        assert not recipe.get("private") or not {"sha256", "draws"} & recipe.keys()
+        if "n" in recipe:
+            drawn = {*range(recipe["seed"], recipe["seed"] + recipe["n"])}
+            assert not drawn & seeds, part
+            seeds |= drawn
+    assert name != "lab-1" or len(seeds) == 1000
     assert "What it does not show" in found.card
 
 
