@@ -32,7 +32,13 @@ HERE = Path(__file__).parent
 RESULTS = HERE / "lab.json"
 MANIFESTS = HERE.parent / "scm_world" / "lab" / "manifests"
 PER_PART = 25
-KNOBS = ({}, {"law": "cubic"}, {"selection": True}, {"law": "square"}, {"noise": 0.1})
+KNOBS: tuple[dict[str, Any], ...] = (
+    {},
+    {"law": "cubic"},
+    {"selection": True},
+    {"law": "square"},
+    {"noise": 0.1},
+)
 SOURCES = {
     **{f"servo-{n}": f"servo:{n}" for n in (5, 10, 20)},
     "servo-10-hidden": "servo:10:2",
@@ -48,7 +54,11 @@ def recipes() -> dict[str, dict[str, Any]]:
     found, seed = dict[str, dict[str, Any]](), 0
     for level in (*lab.LEVELS, None):
         for kind in lab.KINDS:
-            recipe = {"kind": kind, "worlds": [*lab.offers(kind)], "knobs": [*KNOBS]}
+            recipe: dict[str, Any] = {
+                "kind": kind,
+                "worlds": [*lab.offers(kind)],
+                "knobs": [*KNOBS],
+            }
             recipe |= {"seed": seed, "n": PER_PART}
             recipe |= {"private": True} if level is None else {"level": level}
             found[f"{kind}-{level or 'private'}"] = recipe
