@@ -1,13 +1,13 @@
 """Agents that choose experiments: at random, by information, and trained.
 
-``python examples/lab_agents.py --train 60000`` needs the extra ``train``. All agents have the same
-six experiments with ten episodes each, and the same estimator answers for them. The questions of
-the training have other seeds than those of the comparison.
+``python examples/lab_agents.py 60000`` trains one with PPO (extra ``train``). All agents have the
+same six experiments with ten episodes each, and the same estimator answers for them. The questions
+of the training have other seeds than those of the comparison.
 """
 
 from __future__ import annotations
 
-import argparse
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -18,7 +18,7 @@ from scm_world.evaluation.statistics import mean_interval
 from scm_world.lab.environment import HIGH, LOW, LabEnv
 
 SETTING: dict[str, Any] = {"kind": "effect", "experiments": 6, "n": 10}
-TRAINED_ON, COMPARED_ON = range(1000, 1064), range(40)
+TRAINED_ON = range(1000, 1064)
 
 
 def opened(seeds: range) -> LabEnv:
@@ -51,26 +51,24 @@ def scores(env: LabEnv, agent: Callable[[np.ndarray], Any]) -> list[float]:
     return found
 
 
-def main(steps: int, compared: range = COMPARED_ON, trained_on: range = TRAINED_ON) -> None:
+def main(steps: str = "0", compared: str = "40") -> None:
     """Print mean scores with intervals."""
-    env = opened(compared)
+    env = opened(range(int(compared)))
     env.action_space.seed(0)
     n = len(env.action_space.nvec)
     agents: dict[str, Callable[[np.ndarray], Any]] = {
         "random": lambda _: env.action_space.sample(),
         "information": lambda observation: informed(observation, n),
     }
-    if steps:
+    if int(steps):
         from stable_baselines3 import PPO
 
-        model = PPO("MlpPolicy", opened(trained_on), seed=0, device="cpu", ent_coef=0.01)
-        model.learn(steps)
+        model = PPO("MlpPolicy", opened(TRAINED_ON), seed=0, device="cpu", ent_coef=0.01)
+        model.learn(int(steps))
         agents["trained"] = lambda seen: model.predict(seen, deterministic=True)[0]
     for name, agent in agents.items():
         print(f"{name}: {mean_interval(scores(env, agent), proportion=True)}")
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--train", type=int, default=0, help="Steps of PPO; 0 for no training.")
-    main(parser.parse_args().train)
+    main(*sys.argv[1:])

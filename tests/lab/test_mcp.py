@@ -98,7 +98,7 @@ def test_a_killed_server_gives_no_budget_back(tmp_path: Path) -> None:
     assert lab.replay(path) == []
     again = Laboratories(ASKED, out=tmp_path)
     assert "submitted" in again.call("observe", {"laboratory": FIRST})["refused"]
-    path.write_text(path.read_text().replace('"remaining": 998', '"remaining": 999'))
+    path.write_text(path.read_text().replace('"n": 2', '"n": 3'))
     with pytest.raises(UnreadableFile, match="other results"):
         Laboratories(ASKED, out=tmp_path)._opened(FIRST)
 
