@@ -15,7 +15,7 @@ from typing import Any
 
 def reply(messages: list[dict[str, Any]]) -> dict[str, Any]:
     """Return the next action of a conversation; each user message has an observation."""
-    said = [text(one["content"]) for one in messages if one["role"] == "user"]
+    said = [text_of(one["content"]) for one in messages if one["role"] == "user"]
     seen = [json.loads(one)["observation"]["result"] for one in said]
     query = seen[0]["query"]
     if len(seen) <= 2:
@@ -25,7 +25,7 @@ def reply(messages: list[dict[str, Any]]) -> dict[str, Any]:
     return {"tool_name": "submit", "arguments": {"answer": high - low, "confidence": 0.9}}
 
 
-def text(content: Any) -> str:
+def text_of(content: Any) -> str:
     """Return the text of a message, which may have parts."""
     return content if isinstance(content, str) else "".join(part["text"] for part in content)
 
@@ -38,20 +38,26 @@ class Handler(BaseHTTPRequestHandler):
     def do_POST(self) -> None:  # the name of the base class
         """Answer a request."""
         asked = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
-        content = json.dumps({"type": "call_tool", **reply(asked["messages"])})
-        choice = {
-            "index": 0,
-            "message": {"role": "assistant", "content": content},
-            "finish_reason": "stop",
+        said = {
+            "role": "assistant",
+            "content": json.dumps({"type": "call_tool", **reply(asked["messages"])}),
         }
+        found = {"id": "1", "created": 0, "model": asked["model"]}
+        choice = {"index": 0, "finish_reason": "stop"}
         usage = {"prompt_tokens": 1, "completion_tokens": 1, "total_tokens": 2}
-        found = {"id": "1", "object": "chat.completion", "created": 0, "model": asked["model"]}
-        data = json.dumps({**found, "choices": [choice], "usage": usage}).encode()
+        if asked.get("stream"):
+            chunk = {**found, "object": "chat.completion.chunk", "usage": usage}
+            chunk["choices"] = [{**choice, "delta": said}]
+            kind, text = "text/event-stream", f"data: {json.dumps(chunk)}\n\ndata: [DONE]\n\n"
+        else:
+            whole = {**found, "object": "chat.completion", "usage": usage}
+            whole["choices"] = [{**choice, "message": said}]
+            kind, text = "application/json", json.dumps(whole)
         self.send_response(200)
-        self.send_header("Content-Type", "application/json")
-        self.send_header("Content-Length", str(len(data)))
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(text.encode())))
         self.end_headers()
-        self.wfile.write(data)
+        self.wfile.write(text.encode())
 
 
 if __name__ == "__main__":

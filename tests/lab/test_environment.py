@@ -59,7 +59,7 @@ def test_an_effect_is_estimated_from_what_the_agent_tried() -> None:
 
 def test_information_beats_chance() -> None:
     """Whoever sets the cause that is asked for scores more than whoever sets anything."""
-    env = opened(seeds=6, experiments=6)
+    env = opened(seeds=6, experiments=6, n=40)
     n, found = len(env.action_space.nvec), {"random": 0.0, "information": 0.0}
     env.action_space.seed(0)
     for name in found:
