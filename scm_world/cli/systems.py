@@ -513,6 +513,7 @@ def fit(
     symmetric: bool = False,
     held_out: options.Amount = 0.0,
     predict: options.Words = None,
+    diagnose: bool = False,
     suggest: options.NotNegative = 0,
     steps: Annotated[int | None, typer.Option(min=2, show_default="the longest run's")] = None,
     limits: Annotated[list[str] | None, typer.Option(metavar="NAME=LOW,HIGH")] = None,
@@ -544,6 +545,8 @@ def fit(
         symmetric: Whether fitted ranges [-a, a] stay symmetric.
         held_out: Share of the rows at the end of each run that are predicted, not fitted.
         predict: Another recording, which is predicted by the fit and by the unfitted world.
+        diagnose: Whether to try standard terms that the system lacks, such as backlash or the lag
+            of a sensor, on what the fit leaves; Ctrl-C ends it with those that were tried.
         suggest: Number of further experiments that are suggested; their commands are written.
         steps: Control steps of a suggested experiment.
         limits: Range that suggested experiments keep, such as '*.velocity=-2,2', besides those of
@@ -580,6 +583,7 @@ def fit(
             found, frames = deviation.fit, {"explanation": deviation.table}
         predictions = {other: found.predict(other, **names) for other in predict or ()}
         other = found.counterfactual(request, at=at, run=run, seed=asked.seed) if request else None
+        diagnosis = found.diagnose(progress=tell) if diagnose else None
         try:
             if suggest:
                 experiments = found.suggest(suggest, steps=steps, limits=ranges, seed=asked.seed)
@@ -589,6 +593,7 @@ def fit(
     console.say(shown, *(() if parameters else found.remarks))
     if parameters:
         console.frame(combinations, title="identifiable")
+    console.say(*([] if diagnosis is None else [diagnosis]))
     console.say(*(f"{path}: {prediction}" for path, prediction in predictions.items()))
     if found.held_out is not None:
         predictions["held out"] = found.held_out
@@ -609,6 +614,7 @@ def fit(
         explains=found.explains,
         remarks=found.remarks,
         replay=found.replay.to_dict("records"),
+        diagnosis=[] if diagnosis is None else diagnosis.table.to_dict("records"),
         predictions={name: one.table.to_dict("records") for name, one in predictions.items()},
         starts=[experiment.start for experiment in experiments],
     )
