@@ -10,6 +10,7 @@ from typer.core import TyperGroup
 
 from scm_world.cli import console, suites
 from scm_world.cli.data import collect, discover, sweep, triplets, verify
+from scm_world.cli.lab import serve
 from scm_world.cli.options import command
 from scm_world.cli.policies import clone, evaluate, explain, train
 from scm_world.cli.systems import (
@@ -50,6 +51,13 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
+laboratories = typer.Typer(
+    name="lab",
+    no_args_is_help=True,
+    help="Laboratories for agents: certified causal questions.\n\n"
+    "Example: scm-world lab serve effect --mcp",
+)
+app.add_typer(laboratories)
 SUITE = "Benchmark suites: list them, make them anew, score answers. Example: scm-world suite list"
 suite = typer.Typer(no_args_is_help=True)
 app.add_typer(suite, name="suite", help=SUITE)
@@ -82,6 +90,7 @@ COMMANDS: tuple[Callable[..., None], ...] = (
 )
 GROUPS: Mapping[typer.Typer, tuple[Callable[..., None], ...]] = {
     app: COMMANDS,
+    laboratories: (serve,),
     suite: (suites.list_, suites.make, suites.score),
 }
 for _group, _functions in GROUPS.items():
