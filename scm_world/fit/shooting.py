@@ -41,6 +41,7 @@ from scm_world.variables import Rotations
 from scm_world.world import Simulation
 
 ROWS = 32  # worlds that are stepped together
+MOST_ROWS = 128  # the same of a long recording
 LOST = b"lost"  # in place of the parameters of a world whose state was lost
 LIFT = 10.0  # [m] between free bodies while their shapes change
 TINY = 1e-9  # change of the measurements by a scaled unit that is none, in their spread
@@ -67,7 +68,8 @@ class Shooting(Simulator):
         self.targets, self._open = tuple(targets), ExitStack()
         self._names = tuple(dict.fromkeys(c.variable for c in measured.recorded))
         segments = sum(-(-len(run.instants) // SHORT) for run in self.runs)
-        n = min(ROWS, 2 * segments * (2 + len(targets)))
+        tasks = segments * (2 + len(targets))  # of a linearisation, about
+        n = min(MOST_ROWS, max(ROWS, tasks // 2), 2 * tasks)
         together = twins_of(world).together(n, self._names, cores())
         self._batch = self._open.enter_context(together)
         self._reset()
@@ -361,19 +363,17 @@ class Shooting(Simulator):
         Before the measurements of a step, ``before`` is called with the number of the step.
         """
         steps, size = np.full(len(self._batch), -1), self._batch.world(0).compiled.n_actions
+        now = np.zeros((max(map(len, commands.values())), len(self._batch), size))
         for row, sent in commands.items():
             steps[row] = len(sent)
-        seen = np.empty((int(steps.max()) + 1, len(self._batch), len(self.columns)))
+            now[: len(sent), row] = sent if sent.ndim == 2 else sent[:, -1]
+        parted = {row: sent for row, sent in commands.items() if sent.ndim > 2}
+        seen = np.empty((len(now) + 1, len(self._batch), len(self.columns)))
         for step in range(len(seen)):
             going = steps >= step
             if step:
-                now, within = np.zeros((len(self._batch), size)), dict[int, Floats]()
-                for row in np.flatnonzero(going).tolist():
-                    sent = commands[row][step - 1]
-                    now[row] = sent if sent.ndim == 1 else sent[-1]
-                    if sent.ndim > 1:
-                        within[row] = sent
-                self._batch.advance(now, going, within)
+                within = {row: sent[step - 1] for row, sent in parted.items() if going[row]}
+                self._batch.advance(now[step - 1], going, within)
             if before is not None:
                 before(step)
             for table, rows in self._batch.by_structure(np.flatnonzero(going)):
