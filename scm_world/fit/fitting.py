@@ -116,7 +116,7 @@ def fit(
                         break
                     outliers += new
                     minima = Minima(minima.problem.without(new), search, tell)
-                    first = minima.found(range(number), first)
+                    first = minima.continued(range(number), first)
                     measured = minima.problem.measured
                 searched[rows] = first
                 if first.joined or attempt == len(usual):
