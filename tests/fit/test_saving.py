@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 import scm_world as sw
 from scm_world.cli.app import app
 from scm_world.errors import ModelError, UnknownOption
-from scm_world.variables import Function
+from scm_world.variables import Derived
 
 MODEL = """<mujoco model="pendulum">
   <!-- not this one: <joint name="hinge" damping="9"/> -->
@@ -290,7 +290,7 @@ def test_variables_of_ties_are_refused(tmp_path: Path) -> None:
         return 0.001 * density
 
     density = sw.Exogenous(name="density", default=200.0, bounds=sw.Box(10.0, 1000.0))
-    mass = Function(name="pole.mass", unit="kg", parents=("density",), mechanism=weighed)
+    mass = Derived(name="pole.mass", parents=("density",), mechanism=weighed)
     world = sw.World(MODEL, ties=[density, mass])
     fit = world.fit(recorded(world, {"density": 300.0}), ["density"], noise=1e-3)
     with pytest.raises(ModelError, match=r"density are variables of ties=.*save values as \.yaml"):
