@@ -291,7 +291,7 @@ def test_variables_of_ties_are_refused(tmp_path: Path) -> None:
 
     density = sw.Exogenous(name="density", default=200.0, bounds=sw.Box(10.0, 1000.0))
     mass = Derived(name="pole.mass", parents=("density",), mechanism=weighed)
-    world = sw.World(MODEL, ties=[density, mass])
+    world = sw.World(MODEL, ties=[density, mass], expose=["*", "density"])
     fit = world.fit(recorded(world, {"density": 300.0}), ["density"], noise=1e-3)
     with pytest.raises(ModelError, match=r"density are variables of ties=.*save values as \.yaml"):
         fit.save(tmp_path / "arm.xml")
