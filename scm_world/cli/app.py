@@ -10,6 +10,7 @@ from typer.core import TyperGroup
 
 from scm_world.cli import console
 from scm_world.cli.data import collect, discover, sweep, triplets, verify
+from scm_world.cli.laboratory import lab
 from scm_world.cli.options import command
 from scm_world.cli.policies import clone, evaluate, explain, train
 from scm_world.cli.systems import (
@@ -75,7 +76,7 @@ def root(
 
 COMMANDS: tuple[Callable[..., None], ...] = (
     *(discover, verify, check, graph, variables, do, effect, counterfactual, fit),
-    *(collect, sweep, triplets, evaluate, explain, train, clone, studio, list_),
+    *(collect, sweep, triplets, evaluate, explain, train, clone, studio, lab, list_),
 )
 for _function in COMMANDS:
     _command = command(_function)
