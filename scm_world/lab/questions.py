@@ -383,8 +383,9 @@ def _grade_prediction(answer: Any, question: Question) -> float:
 def _counterfactual(bench: Bench, rng: np.random.Generator) -> Made:
     cause, outcome = _pair(bench, rng)
     run, other = bench.unit({})
-    low, high = bench.ends(cause)
-    value = _inside(bench, cause, 0.9 if run[cause] < 0.5 * (low + high) else 0.1)
+    one = bench.quantities[cause]
+    is_low = bench.inner(cause, run[cause]) < 0.5 * (one.low + one.high)
+    value = _inside(bench, cause, 0.9 if is_low else 0.1)
     answer = other({cause: value})[outcome]
     size = abs(answer - run[outcome])
     if size < 0.3 * bench.spread[outcome]:
