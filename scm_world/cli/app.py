@@ -9,8 +9,8 @@ import typer
 from typer.core import TyperGroup
 
 from scm_world.cli import console
+from scm_world.cli import lab as lab_commands
 from scm_world.cli.data import collect, discover, sweep, triplets, verify
-from scm_world.cli.laboratory import lab
 from scm_world.cli.options import command
 from scm_world.cli.policies import clone, evaluate, explain, train
 from scm_world.cli.systems import (
@@ -76,8 +76,19 @@ def root(
 
 COMMANDS: tuple[Callable[..., None], ...] = (
     *(discover, verify, check, graph, variables, do, effect, counterfactual, fit),
-    *(collect, sweep, triplets, evaluate, explain, train, clone, studio, lab, list_),
+    *(collect, sweep, triplets, evaluate, explain, train, clone, studio, list_),
 )
 for _function in COMMANDS:
     _command = command(_function)
     app.command(_function.__name__.rstrip("_"), help=_command.__doc__)(_command)
+
+laboratories = typer.Typer(
+    name="lab",
+    no_args_is_help=True,
+    help="Laboratories for agents: certified causal questions.\n\nExample: scm-world lab run",
+)
+_OF_LABS = "list_ question run play replay serve"
+for _function in (getattr(lab_commands, name) for name in _OF_LABS.split()):
+    _command = command(_function)
+    laboratories.command(_function.__name__.rstrip("_"), help=_command.__doc__)(_command)
+app.add_typer(laboratories)

@@ -15,6 +15,7 @@ from scm_world._arguments import typed, whole_number
 from scm_world._types import Floats, Integers
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.fit.design import PROBES, Experiment, suggested, unseen
+from scm_world.fit.diagnosis import Diagnosis, diagnosed
 from scm_world.fit.prediction import Prediction, predicted
 from scm_world.fit.problem import (
     SHORT,
@@ -52,6 +53,7 @@ from scm_world.fit.targets import (
 )
 from scm_world.fit.units import check_units
 from scm_world.geometry.rotations import aligned
+from scm_world.queries.progress import Progress
 from scm_world.queries.world import World
 from scm_world.runs.canvas import PALETTE, blank, styled
 from scm_world.tasks.model import ModelTask
@@ -67,6 +69,7 @@ DETERMINED = 0.25  # largest standard error of a determined combination: a share
 MISFIT = 1.5  # least residual that the noise does not explain, in standard deviations of it
 AWAY = 0.5  # of the spread of a state in the recording, at which it is far from rest
 WORSE = 1.1  # times the error of the unfitted world, with which a fit replays worse than it
+LEFT = 0.5  # share of the variance within windows that a fit leaves which does not follow them
 SHOWN = 5  # outliers that are named
 MAIN = 0.3  # least share of a parameter in a combination that is named
 DRAWN = 8  # columns of a picture
@@ -91,6 +94,7 @@ class Fit:
         reach: How far the intervals reach down and up, scaled, shape (p, 2); None if linearised.
         shortened: Whether the windows are shorter than usual because segments did not join.
         ended: Whether the search took all its steps before it found a minimum.
+        interrupted: Whether Ctrl-C ended the search; intervals are linearised, none is determined.
         played: See ``replay``, of the fit and the unfitted world, (2, columns).
         later: The rows that were held out.
         outliers: Measurements that were left out: no noise of the others leaves them.
@@ -122,6 +126,7 @@ class Fit:
     reach: Floats | None = None
     shortened: bool = False
     ended: bool = False
+    interrupted: bool = False
     played: Floats | None = None
     later: Measurements | None = None
     outliers: tuple[Outlier, ...] = ()
@@ -292,6 +297,7 @@ class Fit:
 
         linear = np.repeat(self.linear_reach[:, None], 2, axis=1)
         reach, rows = linear if self.reach is None else self.reach, []
+        unsure = self.ended or self.interrupted or self.worse or self.aimless
         for target, number, (down, up) in zip(self.targets, self.scaled, reach, strict=True):
             value, ends = float(target.value(number)), np.array([number - down, number + up])
             open_ends = ends <= target.low, ends >= target.high
@@ -303,7 +309,7 @@ class Fit:
                 low, high = sorted((float(low), float(high)))
                 width, most = (high - low) / target.scale, max(abs(value) / target.scale, 1.0)
             at_most = open_ends[0][0] and high <= target.default
-            determined = bool((width <= most or at_most) and not (self.ended or self.worse))
+            determined = bool((width <= most or at_most) and not unsure)
             if open_ends[0][0] and open_ends[1][1]:
                 low, high, determined = np.nan, np.nan, False
             deviation = value / target.default - 1.0 if target.default else np.nan
@@ -426,6 +432,25 @@ class Fit:
         fit, unfitted = self._replayed
         return unfitted < min(1.0, fit / WORSE)
 
+    @cached_property
+    def aimless(self) -> bool:
+        """Whether a constant replays the recording better, and windows do not follow it either.
+
+        The fit leaves half of the variance of the measurements around their mean in each window,
+        from which start states of their own keep chaos and impacts away.
+        """
+        if not self._replayed[0] > WORSE:
+            return False
+        (row, column), n = self.measured.cells, len(self.columns)
+        values, where = self.measured.values[row, column], self._windows * n + column
+        count = np.maximum(np.bincount(where), 1)
+        away = (values - (np.bincount(where, values) / count)[where]) ** 2
+        left, whole = (
+            by_column(column, squares, n)[0]
+            for squares in ((self.residual * self.noise[column]) ** 2, away)
+        )
+        return bool(np.mean(np.minimum(left / np.maximum(whole, 1e-300), 1.0)) > LEFT)
+
     @typed
     def predict(
         self,
@@ -469,6 +494,21 @@ class Fit:
         randomises by what was not determined. A delay is not among them.
         """
         return posterior_of(self.targets, self.scaled, self.spread)
+
+    @typed
+    def diagnose(self, *, progress: Progress | None = None) -> Diagnosis:
+        """Find out what kind of error of the model leaves the residuals.
+
+        Standard terms are added to the world one at a time, and fitted together with the
+        parameters: gain, offset and lag of each sensor, delay of each command, Coulomb friction,
+        one that falls with speed or grows with the torque, viscous damping, a spring, a torque
+        offset, saturation, backlash and a flexible joint. The extended BIC compares them. They are
+        tried in about 1000 rows, in windows that are spread over the recording.
+
+        Args:
+            progress: Called after each term. After Ctrl-C, the terms that were tried are returned.
+        """
+        return diagnosed(self, progress)
 
     @typed
     def save(self, path: str | Path) -> None:
@@ -520,13 +560,7 @@ class Fit:
     @property
     def remarks(self) -> tuple[str, ...]:
         """Sentences on undetermined parameters and on unexplained residuals."""
-        found = []
-        if self.ended:
-            found.append("the search took all its steps before it found a minimum: others are left")
-        if (every := self.measured.every) > 1:
-            found.append(
-                f"1 of {every} rows is used: lines between these show the motion (thin=1 uses all)"
-            )
+        found = self._about_search
         tried = f"no measurement of this recording, nor of {PROBES} experiments that were tried"
         found += [
             f"no experiment of this model seems to determine {name}: it changes {tried}"
@@ -536,7 +570,8 @@ class Fit:
             :SHOWN
         ]:
             time = self.runs[run].begin + self.measured.control_dt * self.runs[run].instants[row]
-            where = f"row {row}" + f" of run {run}" * (len(self.runs) > 1) + f" ({time:.4g} s)"
+            number = f" {row}" * (self.measured.every == 1)
+            where = f"row{number}{f' of run {run}' * (len(self.runs) > 1)} ({time:.4g} s)"
             found.append(
                 f"{self.columns[column].name} = {value:.4g} in {where} is {off:.3g} from "
                 f"the fit, {abs(off) / self.noise[column]:.3g} times the noise: it was left out"
@@ -545,17 +580,8 @@ class Fit:
             found.append(f"{len(self.outliers)} measurements were left out; fit.outliers has all")
         found += [self.reading] * bool(self.reading)
         groups = [tuple(n for n in names if n not in self.unseen) for names in self.confounded]
-        if self.worse:
-            found.append(
-                "played from the first row, the unfitted world is nearer to the recording than the "
-                "fit: none of these values is determined"
-            )
-            groups = []
-        elif self._replayed[0] > WORSE:
-            found.append(
-                "played from the first row, a constant is nearer to the recording than the fit, "
-                "which does not predict that far ahead"
-            )
+        groups = [] if self.interrupted or self.worse or self.aimless else groups
+        found += self._played
         for names in filter(None, groups):
             alone = len(names) == 1
             said = "is not determined" if alone else "cannot be told apart"
@@ -570,21 +596,10 @@ class Fit:
                 for target in self.targets
                 if target.values is None
             ]
-        if self.shortened:
-            found.append(
-                f"windows of {WINDOW} rows do not explain the recording, those of {self.window} "
-                f"do: there are impacts or chaos, or something acts that is not modelled"
-            )
-        for name, size in self.misfit.items():
-            if size >= MISFIT:
-                said = f"the residuals of {name} are {size:.3g} times as large as its noise"
-                shorter = f"; where bodies bump, window={SHORT} may" * (self.window != SHORT)
-                began = "; or it did not begin as begins= says" * bool(self.measured.begins)
-                found.append(f"{said}: no values that were found explain them{shorter}{began}")
         ends = self.table[["low", "high"]].to_numpy(float)
         sure = self.table.determined.to_numpy(bool)
         about = zip(self.targets, self.scaled, ends, sure, strict=True)
-        found += self._far_starts
+        found += self._about_residuals + self._far_starts
         for target, number, (low, high), determined in about:
             if determined and low <= target.value(target.low) < target.value(number):
                 unit = f" {target.unit}" * (target.unit not in ("", "1"))
@@ -593,6 +608,75 @@ class Fit:
             if min(number - target.low, target.high - number) < near < abs(number):
                 found.append(f"{target.name} is at the end of its range")
         return tuple(found)
+
+    @property
+    def _about_search(self) -> list[str]:
+        """Sentences on how the search ended, and on which rows."""
+        found = list[str]()
+        if self.ended:
+            found.append("the search took all its steps before it found a minimum: others are left")
+        if (every := self.measured.every) > 1:
+            found.append(
+                f"1 of {every} rows is used: lines between these show the motion (thin=1 uses all)"
+            )
+        if self.interrupted:
+            found.append("interrupted: intervals are linearised, and no value is determined")
+        return found
+
+    @property
+    def _about_residuals(self) -> list[str]:
+        """Sentences on what the model does not explain."""
+        found = list[str]()
+        found += self._before
+        for name, size in self.misfit.items():
+            if size >= MISFIT:
+                said = f"the residuals of {name} are {size:.3g} times as large as its noise"
+                shorter = f"; where bodies bump, window={SHORT} may" * (self.window != SHORT)
+                began = "; or it did not begin as begins= says" * bool(self.measured.begins)
+                found.append(f"{said}: no values that were found explain them{shorter}{began}")
+        if self.reach is not None and (self.shortened or not self.explains):
+            found.append(
+                "the model leaves more than noise: intervals contain what each half of the "
+                "recording and windows of other lengths say"
+            )
+        return found
+
+    @property
+    def _played(self) -> list[str]:
+        """A sentence on a replay that is worse than that of the unfitted world or a constant."""
+        none = "none of these values is determined"
+        nearer = "is nearer to the recording than the fit"
+        words = ""
+        if self.interrupted:
+            return []
+        if self.worse:
+            words = f"the unfitted world {nearer}: {none}"
+        elif self.aimless:
+            words = f"a constant {nearer}, and windows do not follow it either: {none}"
+        elif self._replayed[0] > WORSE:
+            words = f"a constant {nearer}, which does not predict that far ahead"
+        return [f"played from the first row, {words}"] if words else []
+
+    @property
+    def _before(self) -> list[str]:
+        """Sentences on commands before the first row, and on windows that are shorter for them."""
+        late, found = 0.0, list[str]()
+        if self.asked is not None:
+            late = delays_of(self.asked, self.targets, self.scaled).max(initial=0.0)
+        if late > 0.0 and any(run.before is None for run in self.runs):
+            found.append(
+                "what was sent before the first row is not known, and the first command is "
+                f"assumed: if another one acted in the first {self.measured.control_dt * late:.3g} "
+                "s of a run, leave its measurements empty there"
+            )
+        if self.shortened:
+            found.append(
+                f"windows of {WINDOW} rows do not explain the recording, those of {self.window} "
+                f"do: there are impacts or chaos, or something acts that is not modelled"
+                + ", such as commands before the first row"
+                * bool(found)
+            )
+        return found
 
     @property
     def _far_starts(self) -> list[str]:
