@@ -17,7 +17,7 @@ from scm_world._types import Floats
 from scm_world.discovery.metrics import evaluate as evaluate_graph
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.lab.expressions import FORM, evaluate
-from scm_world.lab.worlds import WORLDS, Apparatus, Knobs
+from scm_world.lab.worlds import RIGS, WORLDS, Apparatus, Knobs, apparatus
 from scm_world.queries import Laboratory
 from scm_world.variables import Box, Draw, Hard
 
@@ -388,8 +388,9 @@ def _grade_prediction(answer: Any, question: Question) -> float:
 def _counterfactual(bench: Bench, rng: np.random.Generator) -> Made:
     cause, outcome = _pair(bench, rng)
     run, other = bench.unit({})
-    low, high = bench.ends(cause)
-    value = _inside(bench, cause, 0.9 if run[cause] < 0.5 * (low + high) else 0.1)
+    one = bench.quantities[cause]
+    is_low = bench.inner(cause, run[cause]) < 0.5 * (one.low + one.high)
+    value = _inside(bench, cause, 0.9 if is_low else 0.1)
     answer = other({cause: value})[outcome]
     size = abs(answer - run[outcome])
     if size < 0.3 * bench.spread[outcome]:
@@ -515,17 +516,18 @@ KINDS: Mapping[str, Kind] = {
         "The variable that deviates in a recording.", "a name", _diagnosis, _grade_name
     ),
 }
-RIGS_ONLY = ("explanation", "diagnosis")
+FILES = (".xml", ".urdf", ".mjcf")
 
 
 def offers(kind: str) -> tuple[str, ...]:
-    """Return the worlds that have questions of a kind."""
+    """Return the worlds that have questions of a kind; model files have all but ``"graph"``."""
     one_of("kind", kind, tuple(KINDS))
     if kind == "graph":
-        return ("equations", "servo", "network")
-    if kind in RIGS_ONLY:
-        return tuple(world for world in WORLDS if world not in ("equations", "servo", "network"))
-    return tuple(world for world in WORLDS if world != "network")
+        return "equations", "servo", "network"
+    if kind in ("explanation", "diagnosis"):
+        return tuple(RIGS)
+    without = ("network", "boxes") if kind == "law" else ("network",)  # a touch is no expression
+    return tuple(world for world in WORLDS if world not in without)
 
 
 # --- questions ------------------------------------------------------------------------------------
@@ -548,7 +550,7 @@ class Question:
         query: The same as data.
         answer: The exact answer.
         scale: The error up to which an answer has score 1.
-        seal: The key of ``digest``: of a private question, nobody can try answers against it.
+        key: The secret of a private question.
         certificate: Scores of the solver and of trivial answers, and why draws were rejected.
     """
 
@@ -563,7 +565,7 @@ class Question:
     query: Mapping[str, Any] = field(repr=False)
     answer: Any = field(repr=False)
     scale: Any = field(repr=False)
-    seal: bytes = field(repr=False)
+    key: str | None = field(default=None, repr=False)
     certificate: Mapping[str, Any] | None = field(default=None, repr=False)
 
     @classmethod
@@ -625,9 +627,8 @@ class Question:
 
     @property
     def digest(self) -> str:
-        """HMAC-SHA256 of the description and the answer."""
-        text = json.dumps([self.describe(), self.answer], sort_keys=True)
-        return hmac.new(self.seal, text.encode(), hashlib.sha256).hexdigest()
+        """HMAC-SHA256 of the description and the answer under the key, which hides the answer."""
+        return _mac([self.describe(), self.answer], self.key).hex()
 
     def grade(self, answer: Any) -> float:
         """Return the score of an answer, in [0, 1].
@@ -645,6 +646,11 @@ def check_key(key: object) -> None:
         raise UnknownOption("key", type(key), allowed)
 
 
+def _mac(parts: Any, key: str | None) -> bytes:
+    text = json.dumps(parts, sort_keys=True)
+    return hmac.new((key or "").encode(), text.encode(), hashlib.sha256).digest()
+
+
 def made(
     kind: str, world: str, seed: int, level: str, knobs: Knobs, draw: int, key: str | None
 ) -> Question:
@@ -653,15 +659,16 @@ def made(
     Its random numbers follow from an HMAC-SHA256 of kind, world, knobs, seed and draw under the
     key, so that nobody without the key can make it.
     """
-    one_of("world", world, offers(kind))
+    is_file = kind != "graph" and isinstance(world, str) and world.endswith(FILES)
+    if not is_file:
+        one_of("world", world, offers(kind))
     one_of("level", level, tuple(LEVELS))
     seed, draw = whole_number("seed", seed, least=0), whole_number("draw", draw, least=0)
     check_key(key)
-    told = json.dumps([kind, world, seed, draw, asdict(knobs)])
-    hashed = hmac.new((key or "").encode(), told.encode(), hashlib.sha256).digest()
+    hashed = _mac([kind, world, seed, draw, asdict(knobs)], key)
     entropy = int.from_bytes(hashed[:7], "big")
     rng = np.random.default_rng([entropy, 0])
-    bench = Bench(WORLDS[world][0](rng, knobs), level, knobs, entropy)
+    bench = Bench(apparatus(world, rng, knobs), level, knobs, entropy)
     found = KINDS[kind].make(bench, rng)
     return Question(
         kind,
@@ -675,7 +682,7 @@ def made(
         found.query,
         found.answer,
         found.scale,
-        hmac.new((key or "").encode(), b"digest", hashlib.sha256).digest(),
+        key,
     )
 
 
