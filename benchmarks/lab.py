@@ -1,11 +1,10 @@
-"""Measure laboratories: certified questions, their answers, agents by budget; write manifests.
+"""Measure laboratories: certified questions and their answers; write manifests.
 
 ::
 
     python -m benchmarks.lab questions --n 25  # of each kind: certificates and CPU time
     python -m benchmarks.lab truth             # their answers, by an independent script
-    python -m benchmarks.lab agents --n 4      # curves of score by budget
-    python -m benchmarks.lab suites            # the manifests of physics-1 and lab-1
+    python -m benchmarks.lab suites --made DIR # the manifests, with the hashes of made folders
 
 The figures are in ``lab.json``. Questions are those of ``lab-1``, in the order of its parts.
 """
@@ -22,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import as_json
+from benchmarks.lab_truth import confirm
 from scm_world import lab
 from scm_world.discovery.data import load
 from scm_world.discovery.learners.registry import learn
@@ -121,7 +121,7 @@ def jobs(n: int) -> list[dict[str, Any]]:
     for i in range(n):
         for name, recipe in recipes().items():
             if name.endswith(levels[i % len(levels)]):
-                found.append(suites._specs(recipe)[i // len(levels)])
+                found.append(suites._specs(recipe)[i])
     return found
 
 
@@ -234,7 +234,7 @@ def manifests(made: dict[str, Path]) -> None:
 def main() -> None:
     """Run one part."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("part", choices=("questions", "truth", "agents", "suites"))
+    parser.add_argument("part", choices=("questions", "truth", "suites"))
     parser.add_argument("--n", type=int, default=25)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--rows", type=Path, default=HERE / "lab_questions.jsonl")
@@ -242,6 +242,15 @@ def main() -> None:
     given = parser.parse_args()
     if given.part == "questions":
         questions(given.n, given.workers, given.rows)
+    if given.part == "truth":
+        rows = [json.loads(line) for line in given.rows.read_text().splitlines()]
+        found = table(rows)
+        for row in rows:
+            if "spec" in row:
+                outcome = confirm(Question.of(row["spec"]))["confirmed"]
+                count = found[row["spec"]["kind"]].setdefault("confirmed", {})
+                count[str(outcome)] = count.get(str(outcome), 0) + 1
+        RESULTS.write_text(as_json({"questions": found}) + "\n")
     if given.part == "suites":
         manifests({path.name: path for path in given.made})
 
