@@ -124,7 +124,7 @@ def _wanted(
         parts.append(f"{topic} ({kind}): {', '.join(own[:SHOWN]) or 'no numbers'}{more}")
     if not found:
         advice = "name some by columns={'/topic.field': 'hinge.position'}"
-        said = "; ".join(parts) or "nothing"
+        said = "; ".join(parts) or "no messages"
         raise ModelError([f"no column is one of this world: {advice}; there are {said}"])
     return found, "; ".join(parts)
 
