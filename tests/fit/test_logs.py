@@ -195,6 +195,9 @@ def test_commands_of_a_bag_act_at_their_own_time(
     fit = world.fit(place, ["hinge.damping"], columns=CONTROL, noise=1e-4)
     assert fit.values["hinge.damping"] == pytest.approx(0.02, rel=1e-6)
     assert fit.squares < 1e-6
+    assert len(fit.runs[0].part(20, 40, 0.02).commands) == 19
+    same = fit.counterfactual({"hinge.damping": fit.values["hinge.damping"]}, at=5, draws=2)
+    np.testing.assert_allclose(same["counterfactual"], same["measured"], atol=1e-6)
     told = world.fit(
         {"time": 0.02 * np.arange(61), "motor.control": sent, "hinge.position": position},
         ["hinge.damping", "delay"],
@@ -278,7 +281,9 @@ def test_messages_say_what_a_bag_has(
     with pytest.raises(ModelError, match=r"no column is one of this world.*/camera \(sensor_msgs"):
         world.fit(place, ["hinge.damping"], ignore=["/joint*"])
     coarse = sw.World(PENDULUM, control_dt=0.05)
-    with pytest.raises(ModelError, match=r"/joint_states .*apart.*control steps of 0\.05 s"):
+    with pytest.raises(
+        ModelError, match=r"/joint_states, 0.02 s apart, .*control steps of 0\.05 s"
+    ):
         coarse.fit(place, ["hinge.damping"], columns=CONTROL)
     (tmp_path / "x").mkdir()
     bag = Bag(tmp_path / "x", "mcap")
