@@ -511,6 +511,7 @@ def fit(
     ignore: options.Words = None,
     setup: Annotated[list[str] | None, typer.Option(metavar="NUMBER:NAME=VALUE")] = None,
     symmetric: bool = False,
+    thin: options.NotNegative = 0,
     held_out: options.Amount = 0.0,
     predict: options.Words = None,
     suggest: options.NotNegative = 0,
@@ -530,18 +531,21 @@ def fit(
 
     Args:
         recordings: Tables of text (with commas, semicolons or tabs), Parquet or npz files with the
-            time in seconds, every command, and any states or readouts; they are fitted together.
+            time in seconds, every command, and any states or readouts; ROS bags, or LeRobot
+            datasets; they are fitted together.
         parameters: Fitted parameter, such as '*.damping', upper_arm.mass or delay.
         noise: Standard deviation of a measurement; estimated by default.
-        window: Rows of a window, which begins in a fitted state; 0 for 50, or 10 where only these
-            explain the recording.
+        window: Used rows of a window, which begins in a fitted state; 0 for 50, or 10 where only
+            these explain the recording.
         begins: How the recordings begin: 'rest', or a state with its standard deviation, such as
             '*.velocity=0,0.01'; fitted by default.
-        column: Name of this system for a column of the files, such as torque=motor.control.
+        column: Name of this system for a column of the files, such as torque=motor.control, if need
+            be with its unit, 'stamp=time [ms]'.
         ignore: Columns that are left out, such as 'temperature*'.
         setup: Value of a parameter that was set for a recording, such as 1:weight.mass=1.0; the
             first recording has the number 0.
         symmetric: Whether fitted ranges [-a, a] stay symmetric.
+        thin: Every which row is used, 1 for all; 0 for as many as the motion needs.
         held_out: Share of the rows at the end of each run that are predicted, not fitted.
         predict: Another recording, which is predicted by the fit and by the unfitted world.
         suggest: Number of further experiments that are suggested; their commands are written.
@@ -564,7 +568,7 @@ def fit(
         given: dict[str, Any] = {"noise": known, "window": size, "begins": began, "progress": tell}
         texts = parse_assignments(column, "'--column'", lambda text, hint: text)
         names: dict[str, Any] = {"columns": texts, "ignore": ignore or ()}
-        given |= names
+        given |= {**names, "thin": thin or None}
         given["setups"] = _setups(setup, len(recordings)) if setup else None
         shown: sw.Fit | sw.Deviation
         if parameters:

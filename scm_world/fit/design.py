@@ -27,6 +27,7 @@ from scm_world.fit.recordings import (
 )
 from scm_world.fit.shooting import Shooting
 from scm_world.fit.targets import twin_of, values_of
+from scm_world.fit.thinning import thinned
 from scm_world.queries.experiments.probes import touching_pairs
 from scm_world.variables import Rotations
 from scm_world.world import Simulation
@@ -292,7 +293,7 @@ def _planned(fit: Fit, tried: Sequence[Candidate]) -> Measurements:
     values = np.zeros((steps, size))
     values[1:, len(fit.measured.recorded) :] = np.nan
     runs = [RecordedRun(one.commands, np.arange(steps), values, do=one.do) for one in tried]
-    return replace(fit.measured, runs=tuple(runs))
+    return thinned(replace(fit.measured, runs=tuple(runs)), fit.measured.every)
 
 
 def unseen(fit: Fit, names: Sequence[str]) -> tuple[str, ...]:

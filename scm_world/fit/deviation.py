@@ -189,13 +189,14 @@ def explain(
     setups: Sequence[Mapping[str, object]] | None = None,
     columns: Mapping[str, str] | None = None,
     ignore: Iterable[str] = (),
+    thin: int | None = None,
     progress: Progress | None = None,
     search: Search = gauss_newton,
 ) -> Deviation:
     """Fit candidates to a recording, and compare them; see ``World.explain`` and ``Search``."""
     most, world = whole_number("most", most, least=1), world.for_fit(recording)
     how = window, begins, Reading(setups, columns, ignore)
-    measured, targets = arguments_of(world, recording, candidates, *how)
+    measured, targets = arguments_of(world, recording, candidates, *how, thin=thin)
     given = measured.given(noise)
     with Shooting(world, measured, targets) as shooting:
         problem = FitProblem(shooting, measured, targets, given, window)

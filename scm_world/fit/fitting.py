@@ -37,9 +37,10 @@ from scm_world.fit.recordings import (
     read_recording,
 )
 from scm_world.fit.result import DETERMINED, Fit
-from scm_world.fit.search import SAME, SEARCHES, Minima, Result, gauss_newton
+from scm_world.fit.search import SAME, SEARCHES, TINY, Minima, Result, gauss_newton
 from scm_world.fit.shooting import Shooting
 from scm_world.fit.targets import Target, acting, targets_of, twin_of
+from scm_world.fit.thinning import thinned
 from scm_world.fit.units import check_units, reading_of
 from scm_world.queries.progress import Progress
 from scm_world.queries.world import World
@@ -52,6 +53,7 @@ RIDGE = 30.0  # times the error with all others known, of a parameter that other
 PEELS = 3  # times that outliers are left out
 END = 0.1  # largest deviation of the root of the squares at an end of an interval, relative
 OPEN = 300.0  # scaled distance up to which an end is searched
+ALMOST = 0.01  # precision of the squares along a profile, in those at the end of an interval
 PROFILE = 8  # largest number of steps at the end of an interval
 LINEAR = 0.1  # largest deviation from the squares that linearised residuals have there, relative
 
@@ -70,12 +72,13 @@ def fit(
     columns: Mapping[str, str] | None = None,
     ignore: Iterable[str] = (),
     symmetric: bool = False,
+    thin: int | None = None,
     progress: Progress | None = None,
     search: Search = gauss_newton,
 ) -> Fit:
     """Fit parameters to a recording with any search; see ``World.fit`` and ``Search``."""
     world = world.for_fit(recording)
-    how = window, begins, Reading(setups, columns, ignore), symmetric
+    how = window, begins, Reading(setups, columns, ignore), symmetric, thin
     measured, targets = arguments_of(world, recording, as_names(parameters), *how)
     measured, later = (measured, None) if held_out is None else parted(measured, held_out)
     count, number = len(measured.cells[0]), len(targets)
@@ -100,7 +103,8 @@ def fit(
                     break
                 outliers += new
                 minima = Minima(minima.problem.without(new), search)
-                first, measured = minima.found(range(number)), minima.problem.measured
+                first = minima.found(range(number), first)
+                measured = minima.problem.measured
             searched[rows] = first
             if first.joined or attempt == len(usual):
                 found = fitted(minima, range(number), first, progress)
@@ -119,10 +123,13 @@ def arguments_of(
     begins: Begins = None,
     reading: Reading | None = None,
     symmetric: bool = False,
+    thin: int | None = None,
 ) -> tuple[Measurements, tuple[Target, ...]]:
     """Check and read the arguments of a fit; all parameters that act on a measurement if None."""
     if window is not None:
         whole_number("window", window, least=2)
+    if thin is not None:
+        whole_number("thin", thin, least=1)
     if getattr(world.composition.commands, "_drawn", None):
         problem = "the step function draws noise in each step, which a recording does not contain"
         raise ModelError([f"{problem}: leave noise= out, and the residuals have it"])
@@ -134,7 +141,7 @@ def arguments_of(
         asked = acting(twin, measured.columns) if parameters is None else parameters
         targets = targets_of(twin, asked, symmetric=symmetric)
         check_units(world, measured)
-        measured = begun(twin, measured, begins)
+        measured = begun(twin, thinned(measured, thin), begins)
     if any(target.values is not None and not target.values.any() for target in targets):
         with Shooting(world, measured, targets) as shooting:
             targets = shooting.seen(windows_of(measured.runs, SHORT))
@@ -158,9 +165,10 @@ def fitted(
         progress: Called after each search.
     """
     best = first or minima.found(active)
-    misfit = not described(minima, active, best).explains
+    found = described(minima, active, best)
+    about: dict[str, Any] = {"misfit": not found.explains, "discount": found.discount}
     for _ in range(BETTER):
-        best = minima.repeated(active, best, misfit=misfit, progress=progress)
+        best = minima.repeated(active, best, progress=progress, **about)
         found = described(minima, active, best)
         reach, lower = _profile(minima, best, [*active], found)
         if lower is None:
@@ -209,8 +217,9 @@ def _profile(
         limit = problem.high[i] - middle[i] if side else middle[i] - problem.low[i]
         along = (2 * side - 1) * spread[:, place] / spread[place, place]
         others = [j for j in active if j != i]
-        squares = LeastSquares(problem, problem.windows, best.noise, others, most=PROFILE)
         allowed = (linear[place] / found.errors[place]) ** 2 * found.discount
+        rough = ALMOST * allowed / max(found.squares, TINY)
+        squares = LeastSquares(problem, problem.windows, best.noise, others, rough, PROFILE)
         least = 0.0 if best.smooth or found.errors[place] > DETERMINED else linear[place]
         far = min(max(linear[place], STEP), PRIOR)
         near, below, ends, above = 0.0, 0.0, np.inf, np.inf  # distances, and roots of the squares

@@ -15,6 +15,7 @@ from scm_world.fit.problem import SHORT, FitProblem, LeastSquares, by_column, wi
 from scm_world.fit.recordings import Measurements
 from scm_world.fit.search import gauss_newton
 from scm_world.fit.shooting import Shooting
+from scm_world.fit.thinning import thinned
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -106,8 +107,8 @@ def predicted(fit: Fit, measured: Measurements, ahead: float | None) -> Predicti
     import pandas as pd
 
     rows = max(fit.window, 5 * SHORT) - SHORT
-    steps = [int(run.instants[-1]) / (len(run.instants) - 1) for run in measured.runs]
-    period = measured.control_dt * float(np.median(steps))
+    measured = thinned(measured, max(1, round(_period(fit.measured) / _period(measured))))
+    period = _period(measured)
     if ahead is not None:
         rows = round(real_number("ahead", ahead) / period)
     windows = [w for w in windows_of(measured.runs, SHORT + rows) if w.last - w.first > SHORT]
@@ -153,6 +154,12 @@ def predicted(fit: Fit, measured: Measurements, ahead: float | None) -> Predicti
     return Prediction(
         rows * period, every, units, dict(zip(units, map(float, spread), strict=True))
     )
+
+
+def _period(measured: Measurements) -> float:
+    """Return the usual distance of rows [s]."""
+    steps = [int(run.instants[-1]) / max(len(run.instants) - 1, 1) for run in measured.runs]
+    return measured.control_dt * max(float(np.median(steps)), 1.0)
 
 
 def parted(measured: Measurements, share: float) -> tuple[Measurements, Measurements]:

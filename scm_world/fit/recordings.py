@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
@@ -24,6 +24,7 @@ from scm_world.errors import (
     UnreadableFile,
     in_one_line,
 )
+from scm_world.fit.logs import BAGS, SAME, Clock, Log, Step, is_log, read_log
 from scm_world.geometry.rotations import aligned
 from scm_world.queries.episodes import Episode
 from scm_world.runs.files import located, read_arrays, read_bytes
@@ -39,6 +40,7 @@ FRACTION = 0.01  # of a physics step, by which rows may be apart from whole ones
 DRIFT = 0.002  # largest relative error of a clock
 GAP = 1.5  # of the usual distance of rows: a longer one ends a run
 LONG = 500  # control steps from row to row, of which one of another unit of time has more
+SLOW = 25  # the same, where these are a second or more
 FEW = 5  # measurements of which noise can be estimated
 FLOOR = 1e-6  # least noise, relative to the spread of a column
 LEAST = 1e-9  # least noise
@@ -47,9 +49,12 @@ SHOWN = 20  # names that a message lists
 ROUNDING = 1e-3  # of a range, by which commands of a file may exceed it
 UNIT = 10.0  # of a range, which is soft: states that exceed it by more are in another unit
 TURN = 2.0 * np.pi
+FACTORS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "rad": 1.0, "deg": TURN / 360.0}
+FACTORS |= {"rad/s": 1.0, "deg/s": TURN / 360.0, "rpm": TURN / 60.0, "m": 1.0, "mm": 1e-3}
 
 KINDS = (
     "the path of a .csv, .txt, .tsv, .parquet or .npz file",
+    "the path of a ROS bag (a folder, .mcap, .db3, .bag) or of a LeRobot dataset (a folder)",
     "a data frame",
     "arrays by name",
     "an Episode",
@@ -104,6 +109,8 @@ class RecordedRun:
         do: Its set-up: values of parameters that were set for it, by columns.
         before: Commands of the control steps before its first row, if they are known, shape
             (steps, n_actions), of which a delay has the last ones.
+        sent: Where commands were sent within control steps: the time of each in control steps from
+            the first row, ascending, shape (n,), and the commands from there on, (n, n_actions).
     """
 
     commands: Floats
@@ -113,6 +120,7 @@ class RecordedRun:
     whole: bool = True
     do: Mapping[str, float] = field(default_factory=dict)
     before: Floats | None = None
+    sent: tuple[Floats, Floats] | None = None
 
     @cached_property
     def filled(self) -> Floats:
@@ -133,13 +141,42 @@ class RecordedRun:
         sent = np.concatenate([before, self.commands])
         return sent[np.clip(steps + len(before), 0, len(sent) - 1)]
 
+    def acting(self, delays: Floats, steps: Integers, substeps: int) -> Floats:
+        """Return the mean command of each physics step where commands are ``sent`` within them.
+
+        Before the first command, this one is assumed to hold.
+
+        Args:
+            delays: Delay of each command [control steps], shape (n_actions,).
+            steps: Numbers of control steps, shape (n,).
+            substeps: Physics steps of a control step.
+
+        Returns:
+            Shape (n, substeps, n_actions).
+        """
+        every = np.arange(len(self.commands), dtype=float), self.commands
+        times, commands = every if self.sent is None else self.sent
+        found = np.empty((len(steps), substeps, commands.shape[1]))
+        start = steps[:, None] + np.arange(substeps) / substeps
+        for i, delay in enumerate(delays.tolist()):
+            one = commands[:, i]
+            sums = np.concatenate([[0.0], np.cumsum(one[:-1] * np.diff(times))])
+            begin, end = start - delay, start - delay + 1.0 / substeps
+            first = np.maximum(np.searchsorted(times, begin, "right") - 1, 0)
+            last = np.maximum(np.searchsorted(times, end, "left") - 1, 0)
+            before = sums[first] + one[first] * (begin - times[first])
+            after = sums[last] + one[last] * (end - times[last])
+            found[..., i] = np.where(first >= last, one[first], (after - before) * substeps)
+        return found
+
     def part(self, first: int, last: int, control_dt: float) -> RecordedRun:
         """Return the run from a row to that before another one, with the length of a step [s]."""
         since, instants = int(self.instants[first]), self.instants[first:last]
         sent = self.commands[since : int(instants[-1])]
         begin, whole = self.begin + control_dt * since, self.whole and not first
         before = self.late(np.arange(since))
-        rest = self.values[first:last], begin, whole, self.do, before
+        within = None if self.sent is None else (self.sent[0] - since, self.sent[1])
+        rest = self.values[first:last], begin, whole, self.do, before, within
         return RecordedRun(sent, instants - since, *rest)
 
 
@@ -153,12 +190,14 @@ class Measurements:
         columns: Their measured columns.
         control_dt: Length of a control step [s].
         begins: Standard deviations of the last columns, which are known where a run begins.
+        every: Every which row of the recording is among these; see ``thinned``.
     """
 
     runs: tuple[RecordedRun, ...]
     columns: tuple[MeasuredNumber, ...]
     control_dt: float
     begins: tuple[float, ...] = ()
+    every: int = 1
 
     @property
     def recorded(self) -> tuple[MeasuredNumber, ...]:
@@ -276,21 +315,77 @@ class Reading(NamedTuple):
     columns: Mapping[str, str] | None = None
     ignore: Iterable[str] = ()
 
+    def meant(self, names: Iterable[str]) -> dict[str, tuple[str, float | None]]:
+        """Return the columns that are read, of those with some names: a new name, and a factor.
+
+        The factor is None where no unit is given.
+
+        Raises:
+            UnknownOption: A unit is not known.
+        """
+        ignore, found = as_names(self.ignore), dict[str, tuple[str, float | None]]()
+        for own in names:
+            stem, bracket, place = own.partition("[")
+            if fits(own, ignore):
+                continue
+            name, factor = own, None
+            for pattern, given in (self.columns or {}).items():
+                target, unit = _with_unit(given)
+                if target and pattern in (own, stem):
+                    name = target if pattern == own else f"{target}{bracket}{place}"
+                if pattern in (own, stem) or (not target and fits(own, (pattern,))):
+                    factor = unit
+            found[own] = name, factor
+        return found
+
     def named(self, table: Any) -> Any:
-        """Return a table or arrays by name, with the names of this world."""
+        """Return a table or arrays by name, with the names and in the units of this world."""
         if not (self.columns or self.ignore):
             return table
-        columns, names = self.columns or {}, {str(name).strip(): name for name in table}
-        if missing := [name for name in columns if name not in names]:
-            raise UnknownOption("column of the table", missing[0], [*names])
-        ignore = as_names(self.ignore)
-        kept = {own: name for name, own in names.items() if not fits(name, ignore)}
+        names = {str(name).strip(): name for name in table}
+        found = self.meant(names)
         if isinstance(table, Mapping):
-            found = {columns.get(name, name): table[own] for own, name in kept.items()}
-            if len(found) < len(kept):
+            arrays = {
+                name: np.asarray(table[names[own]]) * factor if factor else table[names[own]]
+                for own, (name, factor) in found.items()
+            }
+            if len(arrays) < len(found):
                 raise ModelError(["columns= gives two columns one name: leave one out by ignore="])
-            return found
-        return table[[*kept]].rename(columns=lambda own: columns.get(kept[own], kept[own]))
+            return arrays
+        kept = table[[names[own] for own in found]].set_axis([n for n, _ in found.values()], axis=1)
+        for i, (own, (_, factor)) in enumerate(found.items()):
+            if factor is not None:
+                cells = table[names[own]]
+                try:
+                    kept.isetitem(i, cells.astype(float) * factor)
+                except (TypeError, ValueError) as error:
+                    raise ModelError([f"the column {own!r} has no unit: {error}"]) from error
+        return kept
+
+    def missing(self, names: Collection[str]) -> list[str]:
+        """Return the columns that are renamed, and are not among those with some names."""
+        there = {*names, *(name.partition("[")[0] for name in names)}
+
+        def found(one: str, given: str) -> bool:
+            """Return whether a column is there, or one of the pattern of those with a unit."""
+            return one in there or (given.startswith("[") and any(fits(n, (one,)) for n in names))
+
+        return [one for one, given in (self.columns or {}).items() if not found(one, given)]
+
+
+def _with_unit(given: str) -> tuple[str, float | None]:
+    """Return a name, and the factor of the unit that follows it, if one does.
+
+    Example:
+        >>> _with_unit("time [ms]"), _with_unit("gravity[2]"), _with_unit("[deg]")[0]
+        (('time', 0.001), ('gravity[2]', None), '')
+    """
+    found = re.fullmatch(r"(.*?)\s*\[([^]\d][^]]*)\]", str(given))
+    if found is None:
+        return str(given), None
+    if found[2] not in FACTORS:
+        raise UnknownOption("unit", found[2], FACTORS)
+    return found[1], FACTORS[found[2]]
 
 
 def read_recording(
@@ -322,18 +417,33 @@ def read_recording(
     setups = [{}] * len(every) if how.setups is None else how.setups
     if len(setups) != len(every):
         raise UnknownOption("setups", f"{len(setups)} set-ups", (f"{len(every)}, one of each",))
+    names, has = dict[str, None](), dict[str, str]()  # of all columns; what logs have, in words
     for number, (one, setup) in enumerate(zip(every, setups, strict=True)):
         label = f"run {number}" if one is not recording else ""
-        label, table = (str(one), _file(one)) if isinstance(one, str | Path) else (label, one)
-        if isinstance(table, Mapping | pd.DataFrame):
+        label, table = (
+            (str(one), _file(world, one, how)) if isinstance(one, str | Path) else (label, one)
+        )
+        if isinstance(table, Log):
+            names |= dict.fromkeys(table.names)
+            made = [*_frames(world, table.table, label, setup)]
+            has |= {name: f"{one} has {table.said}" for name, _, _ in made}
+            frames += made
+        elif isinstance(table, Mapping | pd.DataFrame):
+            names |= dict.fromkeys(str(name).strip() for name in table)
             frames += _frames(world, how.named(table), label, setup)
         else:
-            made = _frames(world, table, label, setup)
+            made = [*_frames(world, table, label, setup)]
+            names |= dict.fromkeys(str(name) for _, frame, _ in made for name in frame)
             frames += [(n, how.named(frame), by) for n, frame, by in made]
     if not frames:
         raise UnknownOption("recording", recording, ("one or more runs",))
+    if missing := how.missing(names):
+        allowed = [*names, *dict.fromkeys(has.values())]
+        raise UnknownOption("column of the table", missing[0], allowed)
     for label, frame, _ in frames:
-        _refuse(_faults(world, frame), label * (len(frames) > 1))
+        faults = [*_faults(world, frame)]
+        faults += [has[label]] if faults and label in has else []
+        _refuse(faults, label * (len(frames) > 1))
     seen = (name for _, frame, _ in frames for name in frame if frame[name].notna().any())
     columns = tuple(known[name] for name in dict.fromkeys(seen) if name in known)
     if not columns:
@@ -437,7 +547,7 @@ def _frames(
         for number, one in enumerate(given):
             yield from _frames(world, one, f"run {number}")
     elif isinstance(given, str | Path):
-        yield from _frames(world, _file(given), str(given))
+        raise UnknownOption("recording", str(given), ("paths in a list that is not in another",))
     elif isinstance(given, Episode):
         arrays = {TIME: dt * np.arange(given.steps + 1)}
         names = (*world.compiled.actions, *_states(world))
@@ -502,11 +612,35 @@ def _of_minari(world: Simulation, given: Any) -> pd.DataFrame:
     return _framed(arrays)
 
 
-def _file(path: str | Path) -> pd.DataFrame | dict[str, Value]:
-    """Return a table, or arrays by name."""
+def _file(
+    world: Simulation, path: str | Path, how: Reading
+) -> pd.DataFrame | dict[str, Value] | Log:
+    """Return a table, arrays by name, or the columns of a log that a world has."""
     import pandas as pd
 
     place = located(path)
+    known = columns_of(world) | commands_of(world, bundles=True)
+
+    def chosen(columns: Mapping[str, str], units: bool) -> dict[str, tuple[str, float]]:
+        """Choose the columns of a log that the world has, by their names or by columns=."""
+        found, unsaid = dict[str, tuple[str, float]](), list[str]()
+        for raw, (given, factor) in how.meant(columns).items():
+            name = columns[raw] if given == raw else given
+            if name not in known and given != raw:
+                raise UnknownVariable(name, known)
+            if name not in known or fits(name, as_names(how.ignore)):
+                continue
+            unsaid += [raw] * (not units and factor is None and known[name].unit.startswith("rad"))
+            if twice := [other for other, (one, _) in found.items() if one == name]:
+                said = f"{twice[0]} and {raw} are both {name}"
+                raise ModelError([f"{said}: leave one out by ignore=[{raw!r}]"])
+            found[raw] = name, 1.0 if factor is None else factor
+        if unsaid:
+            said = f"the dataset does not say the unit of {', '.join(unsaid)}, which are often in"
+            advice = f"give it, columns={{{unsaid[0]!r}: '[deg]'}} or '[rad]', patterns too"
+            raise ModelError([f"{said} degrees or in -100 to 100: {advice}; convert others"])
+        return found
+
     readers: dict[str, Callable[[bytes], pd.DataFrame | dict[str, Value]]] = {
         ".csv": _separated,
         ".txt": _separated,
@@ -514,10 +648,15 @@ def _file(path: str | Path) -> pd.DataFrame | dict[str, Value]:
         ".parquet": lambda data: pd.read_parquet(io.BytesIO(data)),
         ".npz": read_arrays,
     }
-    if place.suffix.lower() not in readers:
-        allowed = (f"a file that ends in {', '.join(readers)}",)
+    log = is_log(place)
+    if place.suffix.lower() not in readers and not log:
+        allowed = f"a file that ends in {', '.join((*readers, *BAGS))}", *KINDS[1:2]
         raise UnknownOption("recording", str(path), allowed)
     try:
+        if log:
+            commands = frozenset(commands_of(world, bundles=True))
+            step = Step(world.options.control_period, world.substeps, commands)
+            return read_log(place, chosen, step)
         return readers[place.suffix.lower()](read_bytes(place))
     except FileNotFoundError:
         advice = "give the path of a recording, from the current folder or whole"
@@ -700,10 +839,20 @@ def _runs(
         *_without_jumps(world, columns, values),
     ]
     _refuse(problems, label)
-    steps = np.diff(time)
-    usual = float(np.median(steps))
-    ends = np.flatnonzero((steps > GAP * usual) | np.isnan(sent[:-1]).any(axis=1)) + 1
-    pieces = [rows for rows in np.split(np.arange(len(time)), ends) if len(rows) > 1]
+    seen, places = np.isfinite(values).any(axis=1), np.zeros(len(time))
+    if seen.any():
+        places = Clock.of(time[seen], dt).places(time)
+    within = ~seen & (np.abs(places - np.rint(places)) * world.substeps > SAME)
+    if within.any() and any(f"{name}_past" in world.compiled.slices for name in commands_of(world)):
+        said = f"row {within.argmax()} has a command within a control step of {dt:g} s, and the"
+        advice = "leave its delay out, and fit 'delay' or '*.control_delay'"
+        _refuse([f"{said} world delays commands by control steps: {advice}"], label)
+    known = np.flatnonzero(~within)
+    unknown = np.logical_or.reduceat(np.isnan(sent).any(axis=1), known)
+    steps = np.diff(time[known])
+    usual = float(np.median(steps)) if len(steps) else dt
+    ends = np.flatnonzero((steps > GAP * usual) | unknown[:-1]) + 1
+    pieces = [rows for rows in np.split(known, ends) if len(rows) > 1]
     if not pieces:
         _refuse(["no command is known from one row to the next: fill its column"], label)
     for rows in pieces:
@@ -723,10 +872,15 @@ def _runs(
             _refuse([f"{said}, or resample the recording"], label)
         if np.isfinite(values[rows]).any():
             commands = np.repeat(np.clip(sent[rows[:-1]], low, high), repeats, axis=0)
-            begin, whole = float(time[rows[0]]), not rows[0]
+            begin, whole, late = float(time[rows[0]]), not rows[0], None
+            if len(rows) <= (last := rows[-1] - rows[0]):
+                at = places[rows[0] : rows[-1] + 1] - places[rows[0]]
+                at[rows - rows[0]] = instants
+                late = at[:last], np.clip(sent[rows[0] : rows[-1]], low, high)
             setup = [str(n) for n in numbers if str(n).startswith(DO) and numbers[n].notna().any()]
             do = {name.removeprefix(DO): float(numbers[name].max()) for name in setup}
-            yield RecordedRun(commands, instants, values[rows], begin, whole, do)
+            about = begin, whole, do, None, late
+            yield RecordedRun(commands, instants, values[rows], *about)
 
 
 def _not_rising(time: Floats, dt: float) -> Iterator[str]:
@@ -737,9 +891,12 @@ def _not_rising(time: Floats, dt: float) -> Iterator[str]:
         advice = "sort the rows, remove repeated ones, or tell runs apart by a column 'episode'"
         said = f"{time[row]:.10g} s after {time[row - 1]:.10g} s"
         yield f"time does not rise in row {row}: {said}: {advice}"
-    elif (usual := float(np.median(steps))) > LONG * dt:
-        many = f"{usual / dt:.4g} control steps of {dt:g} s"
-        yield f"rows are {usual:.4g} s apart, which is {many}: give the time in seconds"
+    elif (usual := float(np.median(steps))) > (SLOW * dt if usual >= 1.0 else LONG * dt):
+        units = {name: abs(np.log(FACTORS[name] * usual / dt)) for name in ("ms", "us", "ns")}
+        unit = min(units, key=lambda name: units[name])
+        said = f"rows are {usual:.4g} s apart, which is {usual / dt:.4g} control steps of {dt:g} s"
+        advice = f"give the time in seconds, or its unit, columns={{{TIME!r}: '{TIME} [{unit}]'}}"
+        yield f"{said}: {advice}, or give the world a longer control_dt="
 
 
 def _out_of_range(

@@ -524,6 +524,10 @@ class Fit:
         found = []
         if self.ended:
             found.append("the search took all its steps before it found a minimum: others are left")
+        if (every := self.measured.every) > 1:
+            found.append(
+                f"1 of {every} rows is used: lines between these show the motion (thin=1 uses all)"
+            )
         tried = f"no measurement of this recording, nor of {PROBES} experiments that were tried"
         found += [
             f"no experiment of this model seems to determine {name}: it changes {tried}"

@@ -43,7 +43,9 @@ WIDE = 1e-2  # step of derivatives over which an impact that comes or goes is no
 LESS = 0.9  # relative size of derivatives over a wide step that tells of an impact
 
 TRUST = 1.5  # largest first step of a scaled parameter
-SHARES = (1.0, 0.3, 0.1, 0.0)  # of a step that are tried, the last one for start states only
+EASY = 0.7  # share of the predicted descent with which no other start states are tried
+SHARES = ((1.0, EASY), (1.0, 1e-4), (0.3, 1e-4), (0.1, 1e-4), (0.0, 1e-4))
+# shares of a step that are tried, the last one for start states only, and their least descent
 PRECISION = 0.02  # of the sum of squared residuals, in variances of the noise
 SLOW = 5.0  # a step that leaves more than this, in precisions, is slow; two of them end a search
 HARDLY = 0.05  # share of the predicted descent; a step that leaves less is slow, too
@@ -86,21 +88,22 @@ def gauss_newton(squares: LeastSquares, scaled: Floats, starts: Sequence[Floats]
         smooth = bool(before - after < near) and closed
         if smooth or slow > 1 or number == squares.most - 1:
             break
-        for share in SHARES:
+        for share, least in SHARES:
             other, tried = scaled.copy(), []
             other[active] += share * step
             kinds = ((1.0, 0.0), (1.0, 1.0), (max(share, 0.1), 0.0))
-            for part, damping in kinds[: 2 + (share < 1.0)]:
+            several = 2 + (share < 1.0) if least < EASY else 1
+            for part, damping in kinds[:several]:
                 by = share * step / part
                 moves = [part * move for one in made for move in one.moved(by, damping)]
                 tried.append([*map(moved, starts, moves)])
-            if share == 1.0:
+            if share == 1.0 and several > 1:
                 tried.append(_following(squares.segments, owner, starts, ends))
             all_sizes, all_gaps, all_ends = squares.sizes(other, tried)
             best = (all_sizes + weights * all_gaps).argmin(axis=0)
             new = [each[best, np.arange(len(groups))] for each in (all_sizes, all_gaps)]
             merit = new[0].sum() + weights @ new[1]
-            if merit < before - 1e-4 * share * (before - after):
+            if merit < before - least * share * (before - after):
                 little = max(SLOW * near, HARDLY * (before - after))
                 slow = slow + 1 if before - merit < little and closed else 0
                 starts = [tried[best[w]][i] for i, w in enumerate(owner)]
@@ -171,10 +174,14 @@ class Result(NamedTuple):
     first: Minimum
     others: tuple[Floats, ...] = ()
 
-    def like(self, other: Result, active: Sequence[int]) -> bool:
-        """Return whether it is the same minimum of the active parameters as another one."""
-        far = np.abs(self.at.scaled - other.at.scaled)[[*active]] / other.at.errors
-        return abs(self.loss - other.loss) < SAME and bool((far < NEAR).all())
+    def like(self, other: Result, active: Sequence[int], discount: float = 1.0) -> bool:
+        """Return whether it is the same minimum of the active parameters as another one.
+
+        Correlated residuals increase the variance by a discount.
+        """
+        errors = other.at.errors * discount**0.5
+        far = np.abs(self.at.scaled - other.at.scaled)[[*active]] / errors
+        return abs(self.loss - other.loss) < SAME * discount and bool((far < NEAR).all())
 
 
 @final
@@ -253,6 +260,7 @@ class Minima:
         *,
         same: bool = False,
         misfit: bool = False,
+        discount: float = 1.0,
         progress: Progress | None = None,
     ) -> Result:
         """Repeat a search from other starts until the best minimum was found twice.
@@ -267,6 +275,7 @@ class Minima:
             same: Whether it was found again already.
             misfit: Whether a column has residuals that the noise does not explain: the searches
                 begin farther away.
+            discount: By how much correlated residuals increase the variance.
             progress: Called after each search.
         """
         rng, active, problem = np.random.default_rng(0), [*active], self.problem
@@ -287,10 +296,11 @@ class Minima:
             join = 2 + number % 2
             other = self._joined(active, scaled, starts, best.noise, join, True)
             every.append(other)
-            same = other.like(best, active) or (same and other.loss > best.loss)
+            same = other.like(best, active, discount) or (same and other.loss > best.loss)
             best = min(best, other, key=lambda one: one.loss)
-        good = [one for one in every if one.loss < best.loss + SAME and not one.like(best, active)]
-        return best._replace(others=tuple(one.at.scaled for one in good))
+        good = [one for one in every if one.loss < best.loss + SAME * discount]
+        apart = (one.at.scaled for one in good if not one.like(best, active, discount))
+        return best._replace(others=tuple(apart))
 
     def descended(self, active: Sequence[int], best: Result, other: Minimum) -> Result:
         """Return the minimum that is reached from the start states of other parameters' minimum.

@@ -285,10 +285,14 @@ class Shooting(Simulator):
     def _commands(self, run: RecordedRun, scaled: Floats, steps: Integers) -> Floats:
         """Return what acts in each physics step of some control steps; see ``switched``.
 
-        Shape (n, substeps, n_actions), or (n, n_actions) without delays, or with one physics step.
+        Shape (n, substeps, n_actions), or (n, n_actions) with one physics step, and where commands
+        change where control steps begin.
         """
         world = self._batch.world(0)
         delays = delays_of(world, self.targets, scaled)
+        if run.sent is not None:
+            acting = run.acting(delays, steps, world.substeps)
+            return acting if world.substeps > 1 else acting[:, 0]
         if not delays.any() or not len(run.commands):
             return run.commands[steps]
         acting = np.empty((len(steps), world.substeps, len(delays)))

@@ -51,7 +51,10 @@ class _Reading(NamedTuple):
         values, commands = run.values.copy(), run.commands.copy()
         if self.command is not None:
             commands[:, self.command] *= self.factor
-            return replace(run, commands=commands)
+            sent = None if run.sent is None else (run.sent[0], run.sent[1].copy())
+            if sent is not None:
+                sent[1][:, self.command] *= self.factor
+            return replace(run, commands=commands, sent=sent)
         if self.quaternion:
             values[:, self.places] = values[:, np.roll(self.places, -1)]
             return replace(run, values=values)

@@ -460,6 +460,7 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         columns: Mapping[str, str] | None = None,
         ignore: Iterable[str] = (),
         symmetric: bool = False,
+        thin: int | None = None,
         progress: Progress | None = None,
         search: Search | None = None,
     ) -> Fit:
@@ -474,18 +475,19 @@ class World(Planned, _System, Questions, metaclass=_Opener):
 
         Args:
             recording: A CSV, Parquet or npz file, a data frame or arrays by name, with ``time`` [s]
-                in whole control steps (to a quarter of one), a column for each command, held until
-                the next row, and columns of any states, readouts or outcomes in their units;
-                vectors have columns ``name[i]``, and NaN was not measured. A column ``episode``
-                separates runs, and so do a gap in time and a command that is NaN. Or an
-                ``Episode``, a ``Dataset`` with every step, a dataset of Minari (with observations
-                and actions in units, not normalised), or a list of these.
+                in whole control steps (to a quarter of one; rows that have commands alone at any
+                time), a column for each command, held until the next row, and columns of any
+                states, readouts or outcomes in their units; vectors have columns ``name[i]``, and
+                NaN was not measured. A column ``episode`` separates runs, and so do a gap in time
+                and a command that is NaN. Or a ROS bag, a LeRobot dataset, an ``Episode``, a
+                ``Dataset`` with every step, a dataset of Minari (with observations and actions in
+                units, not normalised), or a list of these.
             parameters: Patterns of parameters, such as ``["*.damping", "upper_arm.mass"]``, or of
                 their components; ``"delay"`` is a delay of all commands. Inertias keep the
                 proportions of their components unless these are named.
             noise: Standard deviations of the measurements: a number, or numbers by patterns of
                 columns; estimated from the residuals if None.
-            window: Number of rows of a window; if None 50, or 10 where only these explain the
+            window: Number of used rows of a window; if None 50, or 10 where only these explain the
                 recording, which is a remark then. Longer windows determine more, and shorter ones
                 bear more disturbances, contacts and chaos.
             begins: How the recording begins, where that was not measured: ``"rest"`` (velocities 0,
@@ -496,9 +498,13 @@ class World(Planned, _System, Questions, metaclass=_Opener):
             setups: The set-up of each of several recordings: values of parameters that were set for
                 it, ``[{}, {"weight.mass": 1.0}]``. A recording may carry its own: a column
                 ``do.weight.mass``, or arrays by name with ``"do": {"weight.mass": 1.0}``.
-            columns: Names of this world by those of the tables, ``{"torque": "motor.control"}``.
+            columns: Names of this world by those of the tables, ``{"torque": "motor.control"}``,
+                if need be with their units, ``{"stamp": "time [ms]"}``.
             ignore: Patterns of columns that are left out.
             symmetric: Whether ranges [-a, a], such as those of forces, stay symmetric.
+            thin: Every which row is used; 1 for all rows. If None, rows at high rates are thinned
+                as far as lines between the used ones pass the others within their noise and 0.3 %
+                of their spread, and 250 rows are left; a remark says so. Commands act as recorded.
             progress: Called after each round of estimating the noise.
             search: What finds the next minimum of least squares; ``gauss_newton`` if None. See
                 ``scm_world.fit.Search``.
@@ -522,7 +528,7 @@ class World(Planned, _System, Questions, metaclass=_Opener):
 
         options: dict[str, Any] = {"noise": noise, "window": window, "begins": begins}
         options |= {"held_out": held_out, "setups": setups, "progress": progress}
-        options |= {"symmetric": symmetric, "columns": columns, "ignore": ignore}
+        options |= {"symmetric": symmetric, "columns": columns, "ignore": ignore, "thin": thin}
         options |= {} if search is None else {"search": search}
         return fit(self, recording, parameters, **options)
 
@@ -539,6 +545,7 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         setups: Sequence[Mapping[str, object]] | None = None,
         columns: Mapping[str, str] | None = None,
         ignore: Iterable[str] = (),
+        thin: int | None = None,
         progress: Progress | None = None,
     ) -> Deviation:
         """Find which parameter accounts for the deviation of a recording from this world.
@@ -561,6 +568,7 @@ class World(Planned, _System, Questions, metaclass=_Opener):
             setups: See ``fit``.
             columns: See ``fit``.
             ignore: See ``fit``.
+            thin: See ``fit``.
             progress: Called after each fit.
 
         Raises:
@@ -574,7 +582,7 @@ class World(Planned, _System, Questions, metaclass=_Opener):
             "begins": begins,
             "setups": setups,
         }
-        options |= {"columns": columns, "ignore": ignore, "most": most}
+        options |= {"columns": columns, "ignore": ignore, "most": most, "thin": thin}
         return explain(self, recording, candidates, progress=progress, **options)
 
     def for_fit(self, recording: object) -> World:

@@ -25,6 +25,7 @@ from scm_world.errors import (
     UnknownOption,
     UnknownVariable,
     WrongValue,
+    blamed,
 )
 from scm_world.variables.checks import check_bounds, check_draw, coerce
 from scm_world.variables.distributions import Distribution
@@ -104,7 +105,9 @@ class Intervention(OpenKinds, Short):
     def value_of(self, variable: Variable, at: Moment) -> Value:
         """Compute what it makes of the variable that it was requested of."""
         arguments = map(np.array, at.arguments(self.follows(variable)))  # copies
-        found = self.equation.bind()(*arguments, **at.noise(variable, self.noise_for(variable)))
+        noise = at.noise(variable, self.noise_for(variable))
+        with blamed(lambda: f"the function of {variable.name!r}"):
+            found = self.equation.bind()(*arguments, **noise)
         value = np.asarray(found)
         if value.dtype.kind not in ("iuf" if variable.dtype == "real" else "biuf"):
             raise WrongValue(variable.name, found, f"numbers of shape {variable.shape}")

@@ -244,6 +244,8 @@ def test_whole_batches_are_single_episodes(monkeypatch: pytest.MonkeyPatch, most
         assert [len(np.unique(part.episode)) <= shard for part in parts] == [True] * len(parts)
         whole = Dataset.joined([replace(part, about={}) for part in parts])
         assert whole == replace(found, about={})
+        listed = [number for part in parts for number in part.about.get("refused", ())]
+        assert sorted(listed, key=int) == sorted(refused, key=int)
 
 
 def test_instants_have_the_action_of_their_step(world: World) -> None:
@@ -417,6 +419,8 @@ def test_equations_are_collected_as_their_world_was_given_them() -> None:
     assert table.values[:, 1].tolist() == [1.0, 1.5] * 3
     assert table.truth is not None
     assert table.truth.edges == (("b", "c", 0),)
+    for part in collect_parts(world, Design("single", ("b",), Shift(0.5), 0.5), 6, shard=4):
+        assert part.truth == table.truth
     assert evaluate([("b", "c", 0)], world).shd == 0
     assert problem(world).truth.edges == (("b", "c", 0),)
     assert learn("paired", SystemSimulator(world)).directed == (("b", "c", 0),)

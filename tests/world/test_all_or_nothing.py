@@ -15,6 +15,7 @@ from scm_world.backends.base import BackendWrapper
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import (
     EngineFailure,
+    FunctionFailure,
     InterventionError,
     SeveralProblems,
     SnapshotMismatch,
@@ -173,6 +174,9 @@ def test_mechanisms_give_numbers(given: Any) -> None:
     values = world.values()
     with pytest.raises(WrongValue, match="floor_color"):
         world.do({"floor_color": Mechanism(lambda friction: given, ["floor_friction"])})
+    assert same(world.values(), values)
+    with pytest.raises(FunctionFailure, match="function of 'floor_color' raised ZeroDivisionError"):
+        world.do({"floor_color": Mechanism(lambda friction: 1 / 0, ["floor_friction"])})
     assert same(world.values(), values)
 
 

@@ -133,9 +133,9 @@ def collect_parts(
 ) -> Iterator[Dataset]:
     """Collect as ``collect`` does, in bounded memory: yield the rows of each file.
 
-    Files that are there come first, the others as they are ready; the ``about`` of each part has
-    its episodes that were ``"refused"`` and the bodies that were ``"touching"``. Arguments and
-    errors are those of ``collect``.
+    Files that are there come first, the others as they are ready. The ``about`` of each part has
+    what that of the whole table has, of its own episodes. Arguments and errors are those of
+    ``collect``.
     """
     how: dict[str, Any] = {
         "shard": shard,
@@ -145,7 +145,9 @@ def collect_parts(
     }
     made, trusted = _rows_of(source, design, seed, circumstances), design.modules
     count = whole_number("n", n, least=1, most=math.inf)
-    return (part for _, part in _parts(made, count, out, **how, trusted=trusted))
+    settings = settings_of(made.about, made.columns, 1)
+    parts = _parts(made, count, out, **how, trusted=trusted)
+    return (together(settings, [part]) for _, part in parts)
 
 
 def _rows_of(

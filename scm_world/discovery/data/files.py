@@ -124,7 +124,7 @@ def batches(
     """Read a dataset file by file, in bounded memory; see ``load``.
 
     Returns:
-        The rows of each file. Their ``about`` has which episodes were ``"refused"``.
+        The rows of each file. Their ``about`` has which of these episodes were ``"refused"``.
     """
     place = located(folder)
     settings, count = settings_in(place, KIND), count_in(place)
@@ -145,7 +145,7 @@ def batches(
                 raise
             advice = "delete it, and collect again with the same settings: only it is made anew"
             raise UnreadableFile(str(path), in_one_line(error), advice) from None
-        yield table
+        yield together(settings, [table])
 
 
 def _columns(folder: Location, settings: Mapping[str, Any]) -> tuple[Column, ...]:
