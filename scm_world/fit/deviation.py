@@ -166,7 +166,7 @@ class Deviation:
         if self.untested:
             names = ", ".join(self.untested[:SHOWN])
             names += f" and {len(self.untested) - SHOWN} more" * (len(self.untested) > SHOWN)
-            said += f"\nno test of {names}: no measurement of this recording changes with them"
+            said += f"\nno measurement of this recording changes with {names}: no test is possible"
         rows = table[: max(SHOWN, len(best))]
         rest = f"\n{len(table) - len(rows)} more candidates" * (len(rows) < len(table))
         if self.screened:
@@ -239,11 +239,12 @@ class _Comparison:
         """Compare the sets; a Ctrl-C ends the search, and what is known by then is returned."""
         try:
             self._compare()
+            best = self._found().chosen
+            played = self._search.played(self._minima[best].at.scaled)
         except KeyboardInterrupt:
-            return replace(self._found(), stopped=True)
-        best = self._found().chosen
-        played = self._search.played(self._minima[best].at.scaled)
+            return replace(self._found(), untested=(), stopped=True)
         self._fits[best] = replace(self._fits[best], played=played)
+        self._report(0)
         return self._found()
 
     def _compare(self) -> None:
@@ -269,8 +270,8 @@ class _Comparison:
                 self._search_thoroughly(best)
 
     def _found(self) -> Deviation:
-        lists = self._numbers.items() if self._acting.any() else ()
-        untested = tuple(name for name, numbers in lists if not self._acting[numbers].any())
+        numbers = self._numbers.items()
+        untested = tuple(name for name, which in numbers if not self._acting[which].any())
         return Deviation(dict(self._fits), self._screened | self._given_up, untested)
 
     def _report(self, ahead: int) -> None:
@@ -406,6 +407,7 @@ class _Comparison:
                     minimum = min(minimum, found, key=lambda one: one.loss)
                 if not turn:
                     minimum = self._search.repeated(active, minimum, same=same)
+                self._report(len(few))
                 if minimum is not before:
                     self._keep(names, minimum)
                 if minimum.loss < before.loss - SAME:
