@@ -527,6 +527,7 @@ def fit(
 
     Without --parameters, each parameter is fitted alone, to find the one that accounts for the
     deviation. Exits 1 if the residuals are larger than the noise: nothing fitted explains them.
+    Ctrl-C writes the best values so far, without what was asked of the fit (exit code 130).
     Example: scm-world fit arm.xml run.csv --parameters "*.damping" --noise elbow.position=0.001
 
     Args:
@@ -563,7 +564,7 @@ def fit(
     name = "-".join(["fit", *(Path(recording).stem for recording in recordings)])
     experiments: tuple[Any, ...] = ()
     failed = None
-    with asked.open(name, task) as (system, folder, engine), console.progress("fits") as tell:
+    with asked.open(name, task) as (system, folder, engine), console.progress("searches") as tell:
         began = "rest" if begins == ["rest"] else parse_assignments(begins, "'--begins'") or None
         given: dict[str, Any] = {"noise": known, "window": size, "begins": began, "progress": tell}
         texts = parse_assignments(column, "'--column'", lambda text, hint: text)
@@ -582,6 +583,8 @@ def fit(
         else:
             shown = deviation = system.explain(recordings, **given)
             found, frames = deviation.fit, {"explanation": deviation.table}
+        if found.interrupted:
+            predict, request, suggest = None, {}, 0
         predictions = {other: found.predict(other, **names) for other in predict or ()}
         other = found.counterfactual(request, at=at, run=run, seed=asked.seed) if request else None
         try:
@@ -625,4 +628,4 @@ def fit(
         console.say(f"written: {path}" + f", which has no {lost}" * bool(lost))
     if failed is not None:
         raise failed
-    raise typer.Exit(int(not found.explains))
+    raise typer.Exit(console.INTERRUPTED if found.interrupted else int(not found.explains))

@@ -36,8 +36,8 @@ from scm_world.fit.recordings import (
     begun,
     read_recording,
 )
-from scm_world.fit.result import DETERMINED, Fit
-from scm_world.fit.search import SAME, SEARCHES, TINY, Minima, Result, gauss_newton
+from scm_world.fit.result import CONFIDENCE, DETERMINED, Fit
+from scm_world.fit.search import SAME, TINY, Minima, Result, gauss_newton
 from scm_world.fit.shooting import Shooting
 from scm_world.fit.targets import Target, acting, targets_of, twin_of
 from scm_world.fit.thinning import thinned
@@ -46,6 +46,9 @@ from scm_world.queries.progress import Progress
 from scm_world.queries.world import World
 
 CLEAR = 1.2  # least misfit where shorter windows explain what usual ones do not
+SEARCHED = 16  # searches before those of intervals, about
+BLOCKS = 10  # of windows that follow one another, at most
+APART = 2.0  # errors of another minimum, from which on an interval contains it
 BETTER = 3  # minima that are found along a profile, at most
 TRIALS = 12  # of an end of an interval, at most
 NEARLY = 0.25  # of a distance with its squares, from which the end of an interval can be determined
@@ -84,7 +87,14 @@ def fit(
     count, number = len(measured.cells[0]), len(targets)
     known = measured.given(noise)
     usual = (WINDOW, SHORT, WINDOW) if window is None else (window,)
-    searched, outliers = dict[int, Result](), list[Outlier]()
+    searched, outliers, told = dict[int, Result](), list[Outlier](), itertools.count(1)
+    planned = SEARCHED + 2 * number
+
+    def tell() -> None:
+        if progress is not None:
+            done = next(told)
+            progress(done, max(planned, done + 1))
+
     for attempt, rows in enumerate(usual, 1):
         with Shooting(world, measured, targets) as shooting:
             states = len(shooting.free)
@@ -93,24 +103,40 @@ def fit(
                 needed = number + states * len(windows_of(measured.runs, rows))
                 allowed = (f"at least {needed} measurements for {number} parameters",)
                 raise UnknownOption("recording", f"{count} measurements", allowed)
-            minima = Minima(FitProblem(shooting, measured, targets, known, rows), search)
-            first = searched.get(rows) or minima.found(range(number))
-            for _ in range(0 if searched else PEELS):  # outliers hide others
-                problem, at = minima.problem, first.at if first.joined else first.first
-                windows = [*itertools.chain(*problem.windows)] if first.joined else problem.segments
-                new = problem.outliers(windows, at.scaled, at.starts)
-                if not new:
-                    break
-                outliers += new
-                minima = Minima(minima.problem.without(new), search)
-                first = minima.found(range(number), first)
-                measured = minima.problem.measured
-            searched[rows] = first
-            if first.joined or attempt == len(usual):
-                found = fitted(minima, range(number), first, progress)
-                if attempt != 2 or max(found.misfit.values()) < CLEAR:
-                    break
-    more = "" if found.explains else reading_of(world, measured)
+            minima = Minima(FitProblem(shooting, measured, targets, known, rows), search, tell)
+            try:
+                first = searched.get(rows) or minima.found(range(number))
+                for _ in range(0 if searched else PEELS):  # outliers hide others
+                    problem, at = minima.problem, first.at if first.joined else first.first
+                    windows = [*itertools.chain(*problem.windows)]
+                    windows = windows if first.joined else problem.segments
+                    new = problem.outliers(windows, at.scaled, at.starts)
+                    if not new:
+                        break
+                    outliers += new
+                    minima = Minima(minima.problem.without(new), search, tell)
+                    first = minima.found(range(number), first)
+                    measured = minima.problem.measured
+                searched[rows] = first
+                if first.joined or attempt == len(usual):
+                    found = fitted(minima, range(number), first)
+                    if attempt != 2 or max(found.misfit.values()) < CLEAR:
+                        others = [one.first for one in searched.values()]
+                        others += [one.at for rest, one in searched.items() if rest != rows]
+                        if attempt == 2 or not found.explains:
+                            found = covering(minima, found, others)
+                        break
+            except KeyboardInterrupt:
+                best = minima.best or minima.reached()
+                if best is None:
+                    raise
+                found = described(minima, range(number), best._replace(smooth=True))
+                found = dataclasses.replace(found, interrupted=True)
+                break
+    if progress is not None:
+        done = next(told)
+        progress(done, done)
+    more = "" if found.explains or found.interrupted else reading_of(world, measured)
     about: dict[str, Any] = {"later": later, "outliers": tuple(outliers), "reading": more}
     return dataclasses.replace(found, shortened=attempt == 2, **about)
 
@@ -148,12 +174,7 @@ def arguments_of(
     return measured, targets
 
 
-def fitted(
-    minima: Minima,
-    active: Sequence[int],
-    first: Result | None = None,
-    progress: Progress | None = None,
-) -> Fit:
+def fitted(minima: Minima, active: Sequence[int], first: Result | None = None) -> Fit:
     """Fit some of the parameters of a problem, the others at their defaults.
 
     Intervals are checked along the profile of the likelihood.
@@ -162,13 +183,12 @@ def fitted(
         minima: Finds minima of the problem.
         active: Numbers of the parameters.
         first: The first minimum, if it was searched.
-        progress: Called after each search.
     """
     best = first or minima.found(active)
     found = described(minima, active, best)
     about: dict[str, Any] = {"misfit": not found.explains, "discount": found.discount}
     for _ in range(BETTER):
-        best = minima.repeated(active, best, progress=progress, **about)
+        best = minima.repeated(active, best, **about)
         found = described(minima, active, best)
         reach, lower = _profile(minima, best, [*active], found)
         if lower is None:
@@ -178,9 +198,46 @@ def fitted(
         away = other[[*active]] - found.scaled
         margin = np.minimum(found.linear_reach, reach.max(axis=1))[:, None]
         reach = np.maximum(reach, np.array([-away, away]).T + margin)
-    if progress is not None:
-        progress(SEARCHES, SEARCHES)
     return dataclasses.replace(found, reach=reach, played=minima.played(best.at.scaled))
+
+
+def covering(minima: Minima, found: Fit, others: Sequence[Minimum]) -> Fit:
+    """Return a fit that leaves more than noise, with intervals of what parts of the recording say.
+
+    They are not less than those of the sandwich estimator, by blocks in time. They contain the
+    minima of both halves, and of windows of other lengths, that are farther away than their errors.
+
+    Args:
+        minima: Finds minima of the problem.
+        found: The fit of all parameters.
+        others: Minima of shorter or longer windows.
+
+    Source:
+        White, *Maximum likelihood estimation of misspecified models*, Econometrica 1982, and Liang
+        and Zeger, *Longitudinal data analysis using generalized linear models*, Biometrika 1986:
+        the sandwich estimator by blocks; Hausman, *Specification tests in econometrics*,
+        Econometrica 1978: another estimate that is farther away than its error shows a wrong model.
+    """
+    from scipy.special import stdtrit
+
+    problem, p, windows = minima.problem, len(found.scaled), len(found.found)
+    reach, blocks = np.array(found.reach), np.array_split(np.arange(windows), min(BLOCKS, windows))
+    if windows > 1:
+        scores = np.array([along.T @ left for left, along in (w.projected for w in found.found)])
+        sums = np.array([scores[one].sum(axis=0) for one in blocks])
+        within = sums @ spread_of(found.sensitivities)
+        errors = np.sqrt((within**2).sum(axis=0) * len(blocks) / (len(blocks) - 1))
+        far = stdtrit(len(blocks) - 1, 0.5 + 0.5 * CONFIDENCE) * errors
+        reach = np.maximum(reach, far[:, None])
+        for part in np.array_split(np.arange(windows), 2):
+            groups, starts = [problem.windows[w] for w in part], [found.starts[w] for w in part]
+            squares = LeastSquares(problem, groups, found.noise, range(p))
+            others = [*others, minima.search(squares, found.scaled, starts)]
+    for other in others:
+        away = other.scaled - found.scaled
+        apart = np.abs(away) > APART * other.errors * found.discount**0.5
+        reach = np.maximum(reach, np.array([-away, away]).T * apart[:, None])
+    return dataclasses.replace(found, reach=reach)
 
 
 def described(minima: Minima, active: Sequence[int], best: Result) -> Fit:

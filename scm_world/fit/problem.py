@@ -234,6 +234,8 @@ class FitProblem:
         segments: All segments.
         noise: Standard deviation of each column, given or estimated, shape (columns,).
         known: Columns whose noise was given, shape (columns,).
+        reached: Where the last linearisation of all parameters and the whole recording was: scaled
+            parameters, segments, and their start states.
     """
 
     def __init__(
@@ -252,6 +254,7 @@ class FitProblem:
         self.segments = [segment for group in self.joined for segment in group]
         self.known = np.isfinite(noise)
         self.noise = np.where(self.known, noise, measured.noise)
+        self.reached: tuple[Floats, Sequence[Window], Sequence[Floats]] | None = None
         self._last: dict[tuple[Window, bytes, bytes], Simulated] = {}
 
     def within(self, scaled: Floats) -> Floats:
@@ -501,6 +504,9 @@ class LeastSquares:
         p, k = len(self.active), len(simulator.free) * follow
         how = self.active, k, step, of_states
         tried, sizes = problem.differences(self.segments, scaled, starts, *how)
+        begins = {(one.run, one.first) for one in self.segments}
+        if p == len(scaled) and begins >= {(w.run, w.first) for (w,) in problem.windows}:
+            problem.reached = scaled.copy(), self.segments, [*starts]
         simulated, found, number = iter(tried), [], 0
         for group in self.groups:
             constant, state, along = np.zeros(k), np.eye(k), np.zeros((k, p))

@@ -91,6 +91,7 @@ class Fit:
         reach: How far the intervals reach down and up, scaled, shape (p, 2); None if linearised.
         shortened: Whether the windows are shorter than usual because segments did not join.
         ended: Whether the search took all its steps before it found a minimum.
+        interrupted: Whether Ctrl-C ended the search; intervals are linearised, none is determined.
         played: See ``replay``, of the fit and the unfitted world, (2, columns).
         later: The rows that were held out.
         outliers: Measurements that were left out: no noise of the others leaves them.
@@ -122,6 +123,7 @@ class Fit:
     reach: Floats | None = None
     shortened: bool = False
     ended: bool = False
+    interrupted: bool = False
     played: Floats | None = None
     later: Measurements | None = None
     outliers: tuple[Outlier, ...] = ()
@@ -292,6 +294,7 @@ class Fit:
 
         linear = np.repeat(self.linear_reach[:, None], 2, axis=1)
         reach, rows = linear if self.reach is None else self.reach, []
+        unsure = self.ended or self.interrupted or self.worse
         for target, number, (down, up) in zip(self.targets, self.scaled, reach, strict=True):
             value, ends = float(target.value(number)), np.array([number - down, number + up])
             open_ends = ends <= target.low, ends >= target.high
@@ -303,7 +306,7 @@ class Fit:
                 low, high = sorted((float(low), float(high)))
                 width, most = (high - low) / target.scale, max(abs(value) / target.scale, 1.0)
             at_most = open_ends[0][0] and high <= target.default
-            determined = bool((width <= most or at_most) and not (self.ended or self.worse))
+            determined = bool((width <= most or at_most) and not unsure)
             if open_ends[0][0] and open_ends[1][1]:
                 low, high, determined = np.nan, np.nan, False
             deviation = value / target.default - 1.0 if target.default else np.nan
@@ -521,13 +524,7 @@ class Fit:
     @property
     def remarks(self) -> tuple[str, ...]:
         """Sentences on undetermined parameters and on unexplained residuals."""
-        found = []
-        if self.ended:
-            found.append("the search took all its steps before it found a minimum: others are left")
-        if (every := self.measured.every) > 1:
-            found.append(
-                f"1 of {every} rows is used: lines between these show the motion (thin=1 uses all)"
-            )
+        found = self._about_search
         tried = f"no measurement of this recording, nor of {PROBES} experiments that were tried"
         found += [
             f"no experiment of this model seems to determine {name}: it changes {tried}"
@@ -537,7 +534,8 @@ class Fit:
             :SHOWN
         ]:
             time = self.runs[run].begin + self.measured.control_dt * self.runs[run].instants[row]
-            where = f"row {row}" + f" of run {run}" * (len(self.runs) > 1) + f" ({time:.4g} s)"
+            number = f" {row}" * (self.measured.every == 1)
+            where = f"row{number}{f' of run {run}' * (len(self.runs) > 1)} ({time:.4g} s)"
             found.append(
                 f"{self.columns[column].name} = {value:.4g} in {where} is {off:.3g} from "
                 f"the fit, {abs(off) / self.noise[column]:.3g} times the noise: it was left out"
@@ -546,7 +544,9 @@ class Fit:
             found.append(f"{len(self.outliers)} measurements were left out; fit.outliers has all")
         found += [self.reading] * bool(self.reading)
         groups = [tuple(n for n in names if n not in self.unseen) for names in self.confounded]
-        if self.worse:
+        if self.interrupted:
+            groups = []
+        elif self.worse:
             found.append(
                 "played from the first row, the unfitted world is nearer to the recording than the "
                 "fit: none of these values is determined"
@@ -571,6 +571,37 @@ class Fit:
                 for target in self.targets
                 if target.values is None
             ]
+        ends = self.table[["low", "high"]].to_numpy(float)
+        sure = self.table.determined.to_numpy(bool)
+        about = zip(self.targets, self.scaled, ends, sure, strict=True)
+        found += self._about_residuals + self._far_starts
+        for target, number, (low, high), determined in about:
+            if determined and low <= target.value(target.low) < target.value(number):
+                unit = f" {target.unit}" * (target.unit not in ("", "1"))
+                found.append(f"{target.name} is at most {high:.3g}{unit}")
+            near = 1e-3 * min(1.0, target.high - target.low)
+            if min(number - target.low, target.high - number) < near < abs(number):
+                found.append(f"{target.name} is at the end of its range")
+        return tuple(found)
+
+    @property
+    def _about_search(self) -> list[str]:
+        """Sentences on how the search ended, and on which rows."""
+        found = list[str]()
+        if self.ended:
+            found.append("the search took all its steps before it found a minimum: others are left")
+        if (every := self.measured.every) > 1:
+            found.append(
+                f"1 of {every} rows is used: lines between these show the motion (thin=1 uses all)"
+            )
+        if self.interrupted:
+            found.append("interrupted: intervals are linearised, and no value is determined")
+        return found
+
+    @property
+    def _about_residuals(self) -> list[str]:
+        """Sentences on what the model does not explain."""
+        found = list[str]()
         if self.shortened:
             found.append(
                 f"windows of {WINDOW} rows do not explain the recording, those of {self.window} "
@@ -582,18 +613,12 @@ class Fit:
                 shorter = f"; where bodies bump, window={SHORT} may" * (self.window != SHORT)
                 began = "; or it did not begin as begins= says" * bool(self.measured.begins)
                 found.append(f"{said}: no values that were found explain them{shorter}{began}")
-        ends = self.table[["low", "high"]].to_numpy(float)
-        sure = self.table.determined.to_numpy(bool)
-        about = zip(self.targets, self.scaled, ends, sure, strict=True)
-        found += self._far_starts
-        for target, number, (low, high), determined in about:
-            if determined and low <= target.value(target.low) < target.value(number):
-                unit = f" {target.unit}" * (target.unit not in ("", "1"))
-                found.append(f"{target.name} is at most {high:.3g}{unit}")
-            near = 1e-3 * min(1.0, target.high - target.low)
-            if min(number - target.low, target.high - number) < near < abs(number):
-                found.append(f"{target.name} is at the end of its range")
-        return tuple(found)
+        if self.reach is not None and (self.shortened or not self.explains):
+            found.append(
+                "the model leaves more than noise: intervals contain what each half of the "
+                "recording and windows of other lengths say"
+            )
+        return found
 
     @property
     def _far_starts(self) -> list[str]:

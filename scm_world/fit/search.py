@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, final
 
 import numpy as np
@@ -22,7 +22,6 @@ from scm_world.fit.problem import (
     projected,
     windows_of,
 )
-from scm_world.queries.progress import Progress
 
 SEARCHES = 6  # largest number of searches for the best minimum
 SAME = 3.0  # largest difference of the loss of equal minima
@@ -191,12 +190,38 @@ class Minima:
     Args:
         problem: The problem.
         search: Searches a minimum near given parameters and start states.
+        tell: Called after each search.
     """
 
-    def __init__(self, problem: FitProblem, search: Search = gauss_newton) -> None:
-        self.problem, self.search = problem, search
+    def __init__(
+        self,
+        problem: FitProblem,
+        search: Search = gauss_newton,
+        tell: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.problem, self._search, self._tell = problem, search, tell
+        self.best: Result | None = None  # of all parameters
         self._guess = [*problem.simulator.guess(problem.segments)]
         self._unfitted: Floats | None = None
+
+    def search(self, squares: LeastSquares, scaled: Floats, starts: Sequence[Floats]) -> Minimum:
+        """Search a minimum, and tell that it was searched; see ``Search``."""
+        at = self._search(squares, scaled, starts)
+        self._tell()
+        return at
+
+    def reached(self) -> Result | None:
+        """Return where an interrupted search of all parameters was; None if it had not begun."""
+        problem, every = self.problem, range(len(self.problem.targets))
+        if problem.reached is None:
+            return None
+        scaled, segments, states = problem.reached
+        begun = {(one.run, one.first): s for one, s in zip(segments, states, strict=True)}
+        starts = [begun[one.run, one.first] for (one,) in problem.windows]
+        squares = LeastSquares(problem, problem.windows, problem.noise, every)
+        at = squares.minimum(scaled, starts, smooth=False)
+        noise, loss = problem.noise_of_windows(at.made, problem.noise)
+        return Result(at, noise, loss, False, False, at)
 
     def found(
         self,
@@ -261,7 +286,6 @@ class Minima:
         same: bool = False,
         misfit: bool = False,
         discount: float = 1.0,
-        progress: Progress | None = None,
     ) -> Result:
         """Repeat a search from other starts until the best minimum was found twice.
 
@@ -276,14 +300,11 @@ class Minima:
             misfit: Whether a column has residuals that the noise does not explain: the searches
                 begin farther away.
             discount: By how much correlated residuals increase the variance.
-            progress: Called after each search.
         """
         rng, active, problem = np.random.default_rng(0), [*active], self.problem
         changed = np.abs(np.log(best.noise / problem.noise)).max() > np.log(OTHER)
         every = [best]
         for number in range(1, SEARCHES):
-            if progress is not None:
-                progress(number, SEARCHES)
             if same or (best.smooth and not changed and not misfit):
                 break
             least, scaled = FARTHER if misfit else ELSEWHERE, best.at.scaled.copy()
@@ -406,7 +427,10 @@ class Minima:
             if number == ROUNDS - 1 or settled:
                 break
             noise = noise if at.ended else new
-        return found._replace(at=at, noise=noise, loss=loss, smooth=smooth)
+        result = found._replace(at=at, noise=noise, loss=loss, smooth=smooth)
+        if len(active) == len(at.scaled) and (self.best is None or loss < self.best.loss):
+            self.best = result
+        return result
 
     def _restarted(
         self, squares: LeastSquares, at: Minimum, usual: Floats | None

@@ -505,7 +505,8 @@ class World(Planned, _System, Questions, metaclass=_Opener):
             thin: Every which row is used; 1 for all rows. If None, rows at high rates are thinned
                 as far as lines between the used ones pass the others within their noise and 0.3 %
                 of their spread, and 250 rows are left; a remark says so. Commands act as recorded.
-            progress: Called after each round of estimating the noise.
+            progress: Called after each search: of the minimum, and of the ends of intervals. How
+                many there will be is not known before.
             search: What finds the next minimum of least squares; ``gauss_newton`` if None. See
                 ``scm_world.fit.Search``.
 
@@ -516,6 +517,12 @@ class World(Planned, _System, Questions, metaclass=_Opener):
             ModelError: Columns are missing, or none of this world; times do not rise, or are not
                 whole control steps; a value lies far outside of its limits, a command at all.
             UnreadableFile: A file is missing or damaged.
+
+        Ctrl-C ends a fit with the best values so far: ``fit.interrupted`` and a remark say so, none
+        is determined. It is raised only before the first values are reached.
+
+        Where the model leaves more than the noise, or only short windows are explained, intervals
+        contain what each half of the recording and windows of other lengths say.
 
         Equations are fitted as a step function. They, and a recorded episode, may have
         interventions on parameters only; a ``ModelError`` says what else stands against it: lags of

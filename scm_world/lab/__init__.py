@@ -1,0 +1,24 @@
+"""Laboratories for agents: certified causal questions, tools, and scores without a judge."""
+
+from scm_world.lab.agents import AGENTS, certify, play
+from scm_world.lab.laboratory import Laboratory, replay, scores, tools
+from scm_world.lab.questions import KINDS, LEVELS, Question, offers, question
+from scm_world.lab.worlds import LAWS, WORLDS, Knobs
+
+__all__ = [
+    "AGENTS",
+    "KINDS",
+    "LAWS",
+    "LEVELS",
+    "WORLDS",
+    "Knobs",
+    "Laboratory",
+    "Question",
+    "certify",
+    "offers",
+    "play",
+    "question",
+    "replay",
+    "scores",
+    "tools",
+]

@@ -1,0 +1,715 @@
+"""Questions about a world, with exact answers."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any, NamedTuple, final
+
+import networkx as nx
+import numpy as np
+
+from scm_world._arguments import one_of, real_number, typed, whole_number
+from scm_world._types import Floats
+from scm_world.discovery.metrics import evaluate as evaluate_graph
+from scm_world.errors import ModelError, UnknownOption
+from scm_world.lab.expressions import FORM, evaluate
+from scm_world.lab.worlds import WORLDS, Apparatus, Knobs
+from scm_world.queries import Laboratory
+from scm_world.variables import Box, Draw, Hard
+
+LEVELS: Mapping[str, str] = {
+    "L1": "names, units and a description",
+    "L2": "names",
+    "L3": "masked names",
+    "L4": "masked names, rescaled and shuffled",
+}
+PASSED, FAILED = 0.95, 0.2
+"""A solver has at least the first score, and no trivial answer more than the second one."""
+DRAWS, PILOT = 40, 40
+"""How many draws of a seed are tried, and units whose spread is that of a reading."""
+
+
+class Unusable(ModelError):
+    """A draw that makes no question."""
+
+
+# --- what an agent sees ---------------------------------------------------------------------------
+
+
+@final
+class Bench:
+    """An apparatus under the names and scales of a level, with noise of its readings.
+
+    Args:
+        apparatus: What can be set and read.
+        level: A name of ``LEVELS``.
+        knobs: Noise and selection.
+        entropy: What all random numbers follow from.
+    """
+
+    def __init__(self, apparatus: Apparatus, level: str, knobs: Knobs, entropy: int) -> None:
+        self.apparatus, self.level, self.knobs, self.entropy = apparatus, level, knobs, entropy
+        rng = np.random.default_rng([entropy, 1])
+        n, masked = len(apparatus.quantities), level in ("L3", "L4")
+        order = rng.permutation(n) if level == "L4" else np.arange(n)
+        scale, shift = np.ones(n), np.zeros(n)
+        if level == "L4":
+            scale, shift = rng.uniform(0.3, 3.0, n) * rng.choice([-1.0, 1.0], n), rng.normal(size=n)
+        self.quantities = {
+            f"v{place + 1}" if masked else apparatus.quantities[i].name: apparatus.quantities[i]
+            for place, i in enumerate(order)
+        }
+        self.names = {one.name: shown for shown, one in self.quantities.items()}
+        self._affine = {
+            shown: (float(scale[i]), float(shift[i]))
+            for shown, i in zip(self.quantities, order, strict=True)
+        }
+        self.readable = [shown for shown, one in self.quantities.items() if one.reads]
+        self._worlds = dict[bool, Laboratory]()
+        pilot = self._table(self._room(True).see(PILOT))
+        self._units = PILOT
+        self.spread = {name: float(np.std(column)) for name, column in pilot.items()}
+        self.middle = {name: float(np.median(column)) for name, column in pilot.items()}
+
+    def _room(self, is_truth: bool) -> Laboratory:
+        """Return the world with units of its own: those of answers, or those of an agent."""
+        if is_truth not in self._worlds:
+            self._worlds[is_truth] = Laboratory(
+                self.apparatus.world,
+                outcomes=[self.quantities[name].reads for name in self.readable],
+                seed=(self.entropy + is_truth) % 2**62,
+                **self.apparatus.setting,
+            )
+        return self._worlds[is_truth]
+
+    def fresh(self) -> Bench:
+        """Return this bench with no unit used."""
+        other = object.__new__(Bench)
+        vars(other).update(vars(self), _worlds={})
+        return other
+
+    # --- scales ---------------------------------------------------------------------------------
+
+    def shown(self, name: str, value: Any) -> Any:
+        """Return a value on the scale of the level."""
+        scale, shift = self._affine[name]
+        return scale * value + shift
+
+    def inner(self, name: str, value: Any) -> Any:
+        """Return a shown value in the unit of the quantity."""
+        scale, shift = self._affine[name]
+        return (value - shift) / scale
+
+    def ends(self, name: str) -> tuple[float, float]:
+        """Return the lowest and the highest value that may be set."""
+        one = self.quantities[name]
+        low, high = sorted((self.shown(name, one.low), self.shown(name, one.high)))
+        return low, high
+
+    def plan(self, do: Mapping[str, Any], at: int = 0) -> dict[str, Any]:
+        """Return the intervention on the world; a pair of numbers is drawn between them."""
+        found = {}
+        for name, value in do.items():
+            one, many = self.quantities[name], np.ravel(value)
+            ends = sorted((one.factor * self.inner(name, many)).tolist())
+            times = {"at": at} if at else {}
+            act = Hard(ends[0], **times) if len(ends) == 1 else Draw(Box(*ends), **times)
+            found[str(one.sets)] = act
+        return found
+
+    def _table(self, samples: Mapping[str, Floats]) -> dict[str, Floats]:
+        columns = samples.values()
+        return {
+            name: np.asarray(self.shown(name, np.ravel(column)))
+            for name, column in zip(self.readable, columns, strict=True)
+        }
+
+    # --- experiments ----------------------------------------------------------------------------
+
+    def run(self, do: Mapping[str, Any], n: int, at: int = 0) -> tuple[dict[str, Floats], int]:
+        """Run episodes of the agent; return noisy readings, and the number of the first one."""
+        room = self._room(False)
+        first = room.spent
+        samples = room.do(self.plan(do, at), n) if do else room.see(n)
+        return self.noisy(self._table(samples), first), first
+
+    def noisy(self, table: dict[str, Floats], first: int) -> dict[str, Floats]:
+        """Add the noise of readings; that of an episode depends on its number only."""
+        n, noise = len(next(iter(table.values()))), self.knobs.noise
+        drawn = np.array(
+            [
+                np.random.default_rng([self.entropy, 2, first + i]).normal(size=len(table))
+                for i in range(n)
+            ]
+        )
+        return {
+            name: column + noise * self.spread[name] * drawn[:, i]
+            for i, (name, column) in enumerate(table.items())
+        }
+
+    # --- answers --------------------------------------------------------------------------------
+
+    def means(self, do: Mapping[str, Any]) -> dict[str, float]:
+        """Return the mean of each reading under an intervention, over held-out units."""
+        world, setting = self.apparatus.world, self.apparatus.setting
+        wanted = [self.quantities[name].reads for name in self.readable]
+        seed = (self.entropy + 2) % 2**62
+        fixed = {n for n, one in self.quantities.items() if one.sets} <= {*do}
+        n = 1 if fixed and self.apparatus.independent else self.apparatus.truth
+        found = world.sample(n, self.plan(do), outcomes=wanted, seed=seed, **setting)
+        return {name: float(column.mean()) for name, column in self._table(found).items()}
+
+    def effect(self, outcome: str, cause: str, ends: Sequence[float]) -> Any:
+        """Return the average effect of a change of a cause, on the scale of the level."""
+        scale, _ = self._affine[outcome]
+        found = self.apparatus.world.effect(
+            self.quantities[outcome].reads,
+            do=self.plan({cause: ends[1]}),
+            versus=self.plan({cause: ends[0]}),
+            n=self.apparatus.truth,
+            seed=(self.entropy + 2) % 2**62,
+            **self.apparatus.setting,
+        )
+        return scale * float(found.mean)
+
+    def unit(
+        self, do: Mapping[str, Any]
+    ) -> tuple[dict[str, float], Callable[..., dict[str, float]]]:
+        """Return the readings of a new unit of the answers, and its counterfactuals."""
+        room = self._room(True)
+        number, self._units = self._units, self._units + 1
+        seen = self._table(room.do(self.plan(do), 1) if do else room.see(1))
+
+        def other(change: Mapping[str, Any]) -> dict[str, float]:
+            found = self._table(room.counterfactual(number, self.plan(change)))
+            return {name: float(column[0]) for name, column in found.items()}
+
+        return {name: float(column[0]) for name, column in seen.items()}, other
+
+
+# --- kinds ----------------------------------------------------------------------------------------
+
+
+class Made(NamedTuple):
+    """A query as the agent gets it, its answer, and what grades need."""
+
+    text: str
+    query: dict[str, Any]
+    answer: Any
+    scale: Any = None
+
+
+class Kind(NamedTuple):
+    """A kind of question.
+
+    Attributes:
+        doc: A sentence.
+        form: The form of an answer.
+        make: Draws a query.
+        grade: Returns the score of an answer, in [0, 1].
+        hides: Whether observations are confounded by a variable that is not shown.
+        late: Whether the query is shown only when the budget is spent.
+    """
+
+    doc: str
+    form: str
+    make: Callable[[Bench, np.random.Generator], Made]
+    grade: Callable[[Any, Question], float]
+    late: bool = False
+
+
+def near(error: float, scale: float) -> float:
+    """Return 1 for an error up to the scale, 0 from three times the scale on."""
+    return float(np.clip(1.5 - 0.5 * error / scale, 0.0, 1.0))
+
+
+def _pair(bench: Bench, rng: np.random.Generator) -> tuple[str, str]:
+    """Draw a settable cause, and an outcome that descends from it; confounded pairs, if any."""
+    made = bench.apparatus
+    graph, outcomes = nx.DiGraph([*made.edges, *made.own]), {one.name for one in made.outcomes}
+    unseen = [(f"hidden {i}", name) for i, pair in enumerate(made.confounded) for name in pair]
+    every = nx.DiGraph([*graph.edges, *unseen])
+    pairs = [
+        (one.name, effect)
+        for one in made.settable
+        if one.name in graph
+        for effect in sorted(nx.descendants(graph, one.name) & outcomes)
+    ]
+    if not pairs:
+        raise Unusable(["nothing acts on an outcome"])
+
+    def confounded(cause: str, effect: str) -> bool:
+        cut = every.copy()
+        cut.remove_edges_from([*every.out_edges(cause)])
+        return not nx.ancestors(cut, cause).isdisjoint(nx.ancestors(cut, effect))
+
+    pairs = [pair for pair in pairs if confounded(*pair)] or pairs
+    cause, outcome = pairs[int(rng.integers(len(pairs)))]
+    return bench.names[cause], bench.names[outcome]
+
+
+def _inside(bench: Bench, name: str, share: float) -> float:
+    one = bench.quantities[name]
+    return round(float(bench.shown(name, one.low + share * (one.high - one.low))), 6)
+
+
+def _graph(bench: Bench, rng: np.random.Generator) -> Made:
+    made, shown = bench.apparatus, bench.names
+    edges = sorted([shown[c], shown[e]] for c, e in made.edges)
+    hidden = sorted(sorted((shown[a], shown[b])) for a, b in made.confounded)
+    own = sorted([shown[c], shown[e]] for c, e in made.own)
+    if not edges:
+        raise Unusable(["no edge"])
+    text = "Which variables act directly on which, and which pairs have a hidden common cause?"
+    return Made(text, {"known": own}, {"edges": edges, "hidden": hidden})
+
+
+def _grade_graph(answer: Any, question: Question) -> float:
+    names, truth = list(question.bench.quantities), question.answer
+    given = _pairs(answer, "edges", names), _pairs(answer, "hidden", names)
+    own = {tuple(edge) for edge in question.query["known"]}
+    edges = [(c, e, 0) for c, e in given[0] if (c, e) not in own]
+    true = [(c, e, 0) for c, e in truth["edges"]]
+    wrong = evaluate_graph(edges, true, names=names).shd
+    pairs = {frozenset(pair) for pair in given[1]}
+    wrong += len(pairs ^ {frozenset(pair) for pair in truth["hidden"]})
+    return max(0.0, 1.0 - 2.0 * wrong / len(true))
+
+
+def _pairs(answer: Any, part: str, names: Sequence[str]) -> list[tuple[str, str]]:
+    found: Any = answer.get(part, ()) if isinstance(answer, Mapping) else None
+    right = isinstance(found, list | tuple) and len(found) <= len(names) ** 2
+    if not right or not {*answer} <= {"edges", "hidden"}:
+        raise UnknownOption("answer", answer, (KINDS["graph"].form,))
+    for pair in found:
+        if not (
+            isinstance(pair, list | tuple) and len(pair) == 2 and {*map(str, pair)} <= {*names}
+        ):
+            raise UnknownOption(f"pair of {part}", pair, (KINDS["graph"].form, *names))
+    return [(str(a), str(b)) for a, b in found if a != b]
+
+
+def _effect(bench: Bench, rng: np.random.Generator) -> Made:
+    cause, outcome = _pair(bench, rng)
+    ends = [_inside(bench, cause, share) for share in (0.2, 0.8)]
+    answer = bench.effect(outcome, cause, ends)
+    if abs(answer) < 0.3 * bench.spread[outcome]:
+        raise Unusable(["the effect is within the noise"])
+    text = (
+        f"By how much does the mean of {outcome} change if {cause} is set to {ends[1]:g} "
+        f"instead of {ends[0]:g}?"
+    )
+    return Made(
+        text,
+        {"cause": cause, "outcome": outcome, "from": ends[0], "to": ends[1]},
+        answer,
+        0.12 * abs(answer),
+    )
+
+
+def _held(bench: Bench, cause: str) -> tuple[dict[str, float], str]:
+    """Return what a question about one cause holds: all others, if none acts on another."""
+    if not bench.apparatus.independent:
+        return {}, ""
+    return {
+        n: v for n, v in _usual(bench).items() if n != cause
+    }, ", all others at their usual value"
+
+
+def _law(bench: Bench, rng: np.random.Generator) -> Made:
+    cause, outcome = _pair(bench, rng)
+    held, words = _held(bench, cause)
+    places = [_inside(bench, cause, share) for share in np.linspace(0.03, 0.97, 13)]
+    found = [bench.means({**held, cause: place})[outcome] for place in places]
+    if np.std(found) < 0.2 * bench.spread[outcome]:
+        raise Unusable(["the law is within the noise"])
+    text = (
+        f"How does the mean of {outcome} depend on {cause}, if {cause} is set{words}? An "
+        f"expression in {cause}, for {places[0]:g} to {places[-1]:g}."
+    )
+    query = {"cause": cause, "outcome": outcome, "held": held}
+    return Made(text, query, {"values": places, "means": found}, 0.12 * float(np.std(found)))
+
+
+def _grade_law(answer: Any, question: Question) -> float:
+    if not isinstance(answer, str):
+        raise UnknownOption("answer", answer, (FORM,))
+    truth = question.answer
+    found = evaluate(answer, {question.query["cause"]: truth["values"]})
+    with np.errstate(all="ignore"):
+        error = float(np.sqrt(np.mean((found - truth["means"]) ** 2)))
+    return near(error, question.scale) if np.isfinite(error) else 0.0
+
+
+def _prediction(bench: Bench, rng: np.random.Generator) -> Made:
+    _, outcome = _pair(bench, rng)
+    causes = [name for name in _usual(bench) if name != outcome]
+    dos = [{n: _inside(bench, n, rng.uniform(0.1, 0.9)) for n in causes} for _ in range(4)]
+    found = [bench.means(do)[outcome] for do in dos]
+    everything = {name: bench.ends(name) for name in causes}
+    spread = bench.apparatus.world.sample(
+        40,
+        bench.plan(everything),
+        outcomes=[bench.quantities[outcome].reads],
+        seed=(bench.entropy + 2) % 2**62,
+        **bench.apparatus.setting,
+    )
+    size = abs(bench._affine[outcome][0]) * float(np.std(next(iter(spread.values()))))
+    if np.ptp(found) < 0.8 * size:
+        raise Unusable(["all answers are alike"])
+    return Made(
+        f"What is the mean of {outcome} under each of these interventions?",
+        {"outcome": outcome, "dos": dos},
+        found,
+        0.12 * size,
+    )
+
+
+def _numbers(answer: Any, n: int) -> Floats:
+    if not isinstance(answer, list | tuple) or len(answer) != n:
+        raise UnknownOption("answer", answer, (f"a list of {n} numbers",))
+    return np.array([real_number("answer", one) for one in answer])
+
+
+def _grade_prediction(answer: Any, question: Question) -> float:
+    errors = np.abs(_numbers(answer, len(question.answer)) - question.answer)
+    return near(float(errors.max()), question.scale)
+
+
+def _counterfactual(bench: Bench, rng: np.random.Generator) -> Made:
+    cause, outcome = _pair(bench, rng)
+    run, other = bench.unit({})
+    low, high = bench.ends(cause)
+    value = _inside(bench, cause, 0.9 if run[cause] < 0.5 * (low + high) else 0.1)
+    answer = other({cause: value})[outcome]
+    size = abs(answer - run[outcome])
+    if size < 0.3 * bench.spread[outcome]:
+        raise Unusable(["the effect on this unit is within the noise"])
+    seen = {name: float(one) for name, one in run.items()}
+    text = (
+        f"In the run below {cause} was {run[cause]:.6g}. What would {outcome} have been in this "
+        f"very run, had {cause} been set to {value:g} from the beginning?"
+    )
+    return Made(
+        text, {"cause": cause, "outcome": outcome, "value": value, "run": seen}, answer, 0.12 * size
+    )
+
+
+def _grade_number(answer: Any, question: Question) -> float:
+    return near(abs(real_number("answer", answer) - question.answer), question.scale)
+
+
+def _control(bench: Bench, rng: np.random.Generator) -> Made:
+    cause, outcome = _pair(bench, rng)
+    hidden = _inside(bench, cause, float(rng.choice([0.12, 0.88])))
+    held, words = _held(bench, cause)
+    target = bench.means({**held, cause: hidden})[outcome]
+    places = [_inside(bench, cause, share) for share in (0.02, 0.5, 0.98)]
+    ends = [bench.means({**held, cause: place})[outcome] for place in places]
+    if np.ptp(ends) < 0.4 * bench.spread[outcome]:
+        raise Unusable(["the outcome hardly follows"])
+    text = f"Which value of {cause} gives {outcome} the mean {target:.6g}{words}?"
+    query = {"cause": cause, "outcome": outcome, "target": target, "held": held}
+    return Made(text, query, {cause: hidden}, 0.05 * float(np.ptp(ends)))
+
+
+def _grade_control(answer: Any, question: Question) -> float:
+    cause = question.query["cause"]
+    if not isinstance(answer, Mapping) or {*answer} != {cause}:
+        raise UnknownOption("answer", answer, (f"{{{cause!r}: a number}}",))
+    low, high = question.bench.ends(cause)
+    value = real_number(f"answer for {cause}", answer[cause], least=low, most=high)
+    do = {**question.query["held"], cause: value}
+    reached = question.bench.means(do)[question.query["outcome"]]
+    return near(abs(reached - question.query["target"]), question.scale)
+
+
+def _usual(bench: Bench) -> dict[str, float]:
+    return {
+        bench.names[one.name]: _inside(bench, bench.names[one.name], 0.5)
+        for one in bench.apparatus.settable
+    }
+
+
+def _explanation(bench: Bench, rng: np.random.Generator) -> Made:
+    _, outcome = _pair(bench, rng)
+    usual, size = _usual(bench), bench.spread[outcome]
+    for _ in range(8):
+        drawn = {name: _inside(bench, name, rng.uniform(0.05, 0.95)) for name in usual}
+        run, other = bench.unit(drawn)
+        apart = {name: run[outcome] - other({name: usual[name]})[outcome] for name in usual}
+        sign = max((1.0, -1.0), key=lambda sign: max(sign * one for one in apart.values()))
+        second, most = sorted(sign * one for one in apart.values())[-2:]
+        if most - max(second, 0.0) > 0.3 * size:
+            break
+    else:
+        raise Unusable(["no single cause"])
+    cause = max(apart, key=lambda name: sign * apart[name])
+    limit = run[outcome] - 0.5 * sign * (most + max(second, 0.0))
+    word = "above" if sign > 0 else "below"
+    text = (
+        f"In the run below {outcome} ended {word} {limit:.6g}: it failed. Which one of the "
+        "variables decided that: had it been set to its usual value, the run would not have failed?"
+    )
+    seen = {name: run[name] for name in run if not bench.quantities[name].sets}
+    query = {"outcome": outcome, "limit": limit, "fails": word, "set": drawn, "usual": usual}
+    return Made(text, query | {"run": seen}, cause)
+
+
+def _diagnosis(bench: Bench, rng: np.random.Generator) -> Made:
+    usual = _usual(bench)
+    cause = str(rng.choice([*usual]))
+    value = _inside(bench, cause, float(rng.choice([0.08, 0.92])))
+    run, _ = bench.unit({**usual, cause: value})
+    still, _ = bench.unit(usual)
+    outcomes = [name for name in run if not bench.quantities[name].sets]
+    moved = [abs(run[n] - still[n]) / bench.spread[n] for n in outcomes if bench.spread[n]]
+    if max(moved) < 0.5:
+        raise Unusable(["nothing is seen of it"])
+    text = "In the recording below one of the variables was not at its usual value. Which one?"
+    seen = {name: run[name] for name in outcomes}
+    return Made(text, {"usual": usual, "run": seen}, cause)
+
+
+def _grade_name(answer: Any, question: Question) -> float:
+    one_of("answer", answer, tuple(question.query["usual"]))
+    return float(answer == question.answer)
+
+
+KINDS: Mapping[str, Kind] = {
+    "graph": Kind(
+        "The edges, their directions, and pairs with a hidden common cause.",
+        '{"edges": [[cause, effect], …], "hidden": [[name, name], …]}',
+        _graph,
+        _grade_graph,
+    ),
+    "effect": Kind("Sign and size of an average effect.", "a number", _effect, _grade_number),
+    "law": Kind("How an outcome depends on a cause.", f"an expression: {FORM}", _law, _grade_law),
+    "prediction": Kind(
+        "An outcome under interventions that were never tried.",
+        "a list of numbers",
+        _prediction,
+        _grade_prediction,
+        late=True,
+    ),
+    "counterfactual": Kind(
+        "An outcome of a given run, had a cause been another.",
+        "a number",
+        _counterfactual,
+        _grade_number,
+    ),
+    "explanation": Kind("The variable that made a run fail.", "a name", _explanation, _grade_name),
+    "control": Kind(
+        "A value that brings an outcome to a target.", '{"name": number}', _control, _grade_control
+    ),
+    "diagnosis": Kind(
+        "The variable that deviates in a recording.", "a name", _diagnosis, _grade_name
+    ),
+}
+RIGS_ONLY = ("explanation", "diagnosis")
+
+
+def offers(kind: str) -> tuple[str, ...]:
+    """Return the worlds that have questions of a kind."""
+    one_of("kind", kind, tuple(KINDS))
+    if kind == "graph":
+        return ("equations", "servo", "network")
+    if kind in RIGS_ONLY:
+        return tuple(world for world in WORLDS if world not in ("equations", "servo", "network"))
+    return tuple(world for world in WORLDS if world != "network")
+
+
+# --- questions ------------------------------------------------------------------------------------
+
+
+@final
+@dataclass(frozen=True)
+class Question:
+    """A question to a laboratory, with its answer.
+
+    Attributes:
+        kind: A name of ``KINDS``.
+        world: A name of ``WORLDS``.
+        seed: Number of the question.
+        level: A name of ``LEVELS``: what an agent knows beforehand.
+        knobs: What makes it harder.
+        draw: How many draws of this seed were not used.
+        bench: The world, as the agent meets it.
+        text: The question in words.
+        query: The same as data.
+        answer: The exact answer.
+        scale: The error up to which an answer has score 1.
+        certificate: Scores of the solver and of trivial answers, and why draws were rejected.
+    """
+
+    kind: str
+    world: str
+    seed: int
+    level: str
+    knobs: Knobs
+    draw: int
+    bench: Bench = field(repr=False)
+    text: str
+    query: Mapping[str, Any] = field(repr=False)
+    answer: Any = field(repr=False)
+    scale: Any = field(repr=False)
+    certificate: Mapping[str, Any] | None = field(default=None, repr=False)
+
+    @classmethod
+    def of(cls, spec: Mapping[str, Any], key: str | None = None) -> Question:
+        """Return the question of a ``spec``, which was certified before.
+
+        Raises:
+            UnknownOption: A part of it does not exist.
+            ModelError: The draw makes no question.
+        """
+        names = ("kind", "world", "seed", "level", "knobs", "draw")
+        if not isinstance(spec, Mapping) or {*spec} != {*names}:
+            raise UnknownOption("spec", spec, names)
+        kind, world, seed, level, knobs, draw = (spec[name] for name in names)
+        return made(kind, world, seed, level, Knobs(**knobs), draw, key)
+
+    @property
+    def spec(self) -> dict[str, Any]:
+        """What the question is made of again, without its key."""
+        return {
+            "kind": self.kind,
+            "world": self.world,
+            "seed": self.seed,
+            "level": self.level,
+            "knobs": asdict(self.knobs),
+            "draw": self.draw,
+        }
+
+    @property
+    def late(self) -> bool:
+        """Whether the query is shown only when the budget is spent."""
+        return KINDS[self.kind].late
+
+    @property
+    def budget(self) -> int:
+        """How many episodes an agent may run."""
+        return self.bench.apparatus.budget
+
+    def describe(self) -> dict[str, Any]:
+        """Return what an agent may know."""
+        bench, apparatus, first = self.bench, self.bench.apparatus, self.level == "L1"
+        variables = []
+        for name, one in bench.quantities.items():
+            about: dict[str, Any] = {"name": name, "readable": one.reads is not None}
+            about["settable"] = list(bench.ends(name)) if one.sets else False
+            variables.append(about | ({"unit": one.unit, "doc": one.doc} if first else {}))
+        return {
+            "kind": self.kind,
+            "about": apparatus.doc if first else KINDS[self.kind].doc,
+            "variables": variables,
+            "settable_variables_act_on_one_another": not apparatus.independent,
+            "noise": self.knobs.noise,
+            "steps": apparatus.setting.get("steps", 1),
+            "budget": self.budget,
+            "answer": KINDS[self.kind].form,
+            "question": self.text,
+            "query": dict(self.query),
+        }
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the description and the answer."""
+        text = json.dumps([self.describe(), self.answer], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def grade(self, answer: Any) -> float:
+        """Return the score of an answer, in [0, 1].
+
+        Raises:
+            UnknownOption: The answer has another form.
+        """
+        return KINDS[self.kind].grade(answer, self)
+
+
+def made(
+    kind: str, world: str, seed: int, level: str, knobs: Knobs, draw: int, key: str | None
+) -> Question:
+    """Return a draw of a question, which is not certified.
+
+    Its random numbers follow from an HMAC-SHA256 of kind, world, knobs, seed and draw under the
+    key, so that nobody without the key can make it.
+    """
+    one_of("world", world, offers(kind))
+    one_of("level", level, tuple(LEVELS))
+    seed, draw = whole_number("seed", seed, least=0), whole_number("draw", draw, least=0)
+    if not (key is None or isinstance(key, str)):
+        raise UnknownOption("key", key, ("a text", "None for a public question"))
+    told = json.dumps([kind, world, seed, draw, asdict(knobs)])
+    hashed = hmac.new((key or "").encode(), told.encode(), hashlib.sha256).digest()
+    entropy = int.from_bytes(hashed[:7], "big")
+    rng = np.random.default_rng([entropy, 0])
+    bench = Bench(WORLDS[world][0](rng, knobs), level, knobs, entropy)
+    found = KINDS[kind].make(bench, rng)
+    return Question(
+        kind,
+        world,
+        seed,
+        level,
+        knobs,
+        draw,
+        bench,
+        found.text,
+        found.query,
+        found.answer,
+        found.scale,
+    )
+
+
+@typed
+def question(
+    kind: str,
+    world: str = "equations",
+    seed: int = 0,
+    level: str = "L2",
+    key: str | None = None,
+    **knobs: Any,
+) -> Question:
+    """Return a certified question.
+
+    Draws of the seed are tried in turn. The first is used that a scripted solver answers within
+    the budget, with the same tools, and that no trivial answer answers.
+
+    Args:
+        kind: ``"graph"``, ``"effect"``, ``"law"``, ``"prediction"``, ``"counterfactual"``,
+            ``"explanation"``, ``"control"`` or ``"diagnosis"``.
+        world: A name of ``WORLDS``.
+        seed: Number of the question.
+        level: What an agent knows beforehand: ``"L1"`` to ``"L4"``.
+        key: A secret; the questions of a key cannot be made without it.
+        knobs: Values of ``Knobs``.
+
+    Raises:
+        UnknownOption: An argument does not exist.
+        ModelError: No draw of the seed can be certified.
+    """
+    from scm_world.lab.agents import certify
+
+    for name in knobs:
+        one_of("knob", name, tuple(Knobs.__dataclass_fields__))
+    settings, rejected = Knobs(**knobs), list[str]()
+    for draw in range(DRAWS):
+        try:
+            plain = made(kind, world, seed, "L2", settings, draw, key)
+        except Unusable as error:
+            rejected.append(str(error))
+            continue
+        scores = certify(plain)
+        trivial = max(scores["trivial"].values())
+        if scores["solver"] >= PASSED and trivial <= FAILED:
+            found = plain if level == "L2" else made(kind, world, seed, level, settings, draw, key)
+            certificate = {**scores, "rejected": rejected}
+            return Question(**{**vars(found), "certificate": certificate})
+        rejected.append(
+            f"the solver has {scores['solver']:.2f}, and a trivial answer {trivial:.2f}"
+        )
+    raise ModelError([f"none of {DRAWS} draws of seed {seed} is a question: {rejected[-1]}"])

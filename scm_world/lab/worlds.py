@@ -1,0 +1,362 @@
+"""The worlds of questions: what can be set and read in each, and its true graph."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, NamedTuple, final
+
+import numpy as np
+
+from scm_world._arguments import one_of, real_number, whole_number
+from scm_world._types import Floats
+from scm_world.queries import SCM, Outcome, World
+from scm_world.queries.questions import Questions
+from scm_world.tasks import ModelTask
+from scm_world.tasks.families import Springs, servo
+from scm_world.variables import (
+    Box,
+    Derived,
+    Draw,
+    Exogenous,
+    Function,
+    Linear,
+    Mechanism,
+    Normal,
+    Shift,
+)
+
+Edge = tuple[str, str]
+
+
+@final
+@dataclass(frozen=True)
+class Quantity:
+    """Something that an agent can read, or set, or both.
+
+    Attributes:
+        name: Its name in the levels L1 and L2.
+        unit: Its unit.
+        doc: A sentence.
+        reads: How it is read in an episode; None if it is not read.
+        sets: The variable of the world that an experiment sets; None if it cannot be set.
+        low: Lower end of the values that may be set.
+        high: Upper end.
+        factor: What is set, over the value that is asked for.
+    """
+
+    name: str
+    unit: str = "1"
+    doc: str = ""
+    reads: Outcome | None = None
+    sets: str | None = None
+    low: float = 0.0
+    high: float = 0.0
+    factor: float = 1.0
+
+
+@final
+@dataclass(frozen=True)
+class Apparatus:
+    """A world, and what may be set and read in it.
+
+    Attributes:
+        world: The world; its context lets the settable quantities vary by themselves.
+        quantities: What an agent can set and read.
+        setting: Further arguments of ``sample``.
+        budget: Episodes that an agent may run.
+        truth: How many units answers are means of.
+        independent: Whether the settable quantities do not act on one another.
+        edges: True edges between quantities, and pairs with a hidden common cause.
+        confounded: Pairs with a hidden common cause.
+        own: Edges that are told and not asked.
+        doc: What the world is, for the level L1.
+    """
+
+    world: Questions
+    quantities: tuple[Quantity, ...]
+    setting: Mapping[str, Any]
+    budget: int
+    doc: str
+    truth: int = 60
+    independent: bool = True
+    edges: tuple[Edge, ...] = ()
+    confounded: tuple[Edge, ...] = ()
+    own: tuple[Edge, ...] = field(default=())
+
+    @property
+    def settable(self) -> tuple[Quantity, ...]:
+        """The quantities that may be set."""
+        return tuple(one for one in self.quantities if one.sets)
+
+    @property
+    def outcomes(self) -> tuple[Quantity, ...]:
+        """The quantities that are read; those alone that cannot be set, if there are any."""
+        read = tuple(one for one in self.quantities if one.reads)
+        return tuple(one for one in read if not one.sets) or read
+
+
+LAWS: Mapping[str, str] = {
+    "plain": "springs and drag are linear",
+    "cubic": "the force of a spring grows with the third power",
+    "square": "drag grows with the square of the speed",
+    "dead zone": "nothing happens below a threshold (dry friction)",
+}
+
+
+@dataclass(frozen=True)
+class Knobs:
+    """What makes a question harder.
+
+    Attributes:
+        noise: Standard deviation of the noise of a reading, as a share of its spread.
+        hidden: Whether a hidden common cause acts on what varies by itself.
+        selection: Whether observations are kept only where one reading is high.
+        law: A name of ``LAWS``.
+        variables: How many variables equations, and networks, have.
+        distractors: How many variables there are in addition that act on nothing.
+
+    Raises:
+        UnknownOption: A value is not allowed.
+    """
+
+    noise: float = 0.02
+    hidden: bool = True
+    selection: bool = False
+    law: str = "plain"
+    variables: int = 5
+    distractors: int = 1
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        real_number("noise", self.noise, least=0.0, most=1.0)
+        one_of("hidden", self.hidden, (True, False))
+        one_of("selection", self.selection, (True, False))
+        one_of("law", self.law, tuple(LAWS))
+        whole_number("variables", self.variables, least=3, most=12)
+        whole_number("distractors", self.distractors, least=0, most=6)
+
+
+# --- equations ------------------------------------------------------------------------------------
+
+
+def bent(*parents: Any, noise: Any = 0.0, weights: Sequence[float], law: float) -> Any:
+    """Return a weighted sum of causes under a law: 1 cubic, 2 square with sign, 3 dead zone."""
+    total = noise
+    for weight, x in zip(weights, parents, strict=True):
+        match law:
+            case 1.0:
+                of = 0.25 * x**3
+            case 2.0:
+                of = 0.5 * x * np.abs(x)
+            case _:
+                of = np.sign(x) * np.maximum(np.abs(x) - 0.5, 0.0)
+        total = total + weight * of
+    return total
+
+
+def equations(rng: np.random.Generator, knobs: Knobs) -> Apparatus:
+    """Draw a random acyclic model; a hidden variable acts on two of the others."""
+    n, extra = knobs.variables, knobs.distractors
+    names = [f"x{i}" for i in rng.permutation(n + extra)]
+    order, upper = names[:n], np.triu(rng.random((n, n)) < 0.5, 1)
+    upper[np.arange(n - 1), np.arange(1, n)] |= ~upper[:-1].any(axis=1)  # all act on something
+    low, high = -1.5, 2.0  # not symmetric, so that even laws have a mean effect
+    pairs = [sorted(rng.choice(n, 2, replace=False).tolist()) for _ in range(2 * knobs.hidden)]
+    hidden = {f"h{k}": (order[i], order[j]) for k, (i, j) in enumerate(pairs)}
+    made: list[Any] = [Exogenous(name=name, distribution=Normal(0.0, 1.2)) for name in hidden]
+    law = float(tuple(LAWS).index(knobs.law))
+    for j, name in enumerate(order):
+        causes = [order[i] for i in np.flatnonzero(upper[:, j])]
+        weights = rng.uniform(0.6, 1.3, len(causes)) * rng.choice([-1.0, 1.0], len(causes))
+        noise = Normal(0.0, 0.5)
+        unseen = [h for h, pair in hidden.items() if name in pair]
+        signs = rng.choice([-1.0, 1.0], len(unseen))
+        causes, weights = [*causes, *unseen], np.append(weights, signs)
+        of: Any = Linear(weights=tuple(weights.tolist()))
+        if law:
+            of = Function(bent, constants={"weights": tuple(weights.tolist()), "law": law})
+        if causes:
+            made.append(Derived(name=name, parents=tuple(causes), mechanism=of, noise=noise))
+        else:
+            made.append(Exogenous(name=name, distribution=Normal()))
+    made += [Exogenous(name=name, distribution=Normal()) for name in names[n:]]
+    quantities = tuple(
+        Quantity(name, "1", "A variable of the model.", Outcome(name), name, low, high)
+        for name in sorted(names)
+    )
+    return Apparatus(
+        SCM(made),
+        quantities,
+        {},
+        2000,
+        f"A causal model of {len(names)} variables without cycles; {LAWS[knobs.law]}.",
+        truth=4000,
+        independent=False,
+        edges=tuple((order[i], order[j]) for i, j in np.argwhere(upper).tolist()),
+        confounded=tuple({tuple(sorted(pair)): pair for pair in hidden.values()}),
+    )
+
+
+def servos(rng: np.random.Generator, knobs: Knobs) -> Apparatus:
+    """Draw a network of arms whose servos follow one another's angles."""
+    n = max(5, knobs.variables)
+    made = servo(n, int(rng.integers(2**31)), int(knobs.hidden))
+    drawn: dict[str, Any] = {one.name: one for one in made.task.ties}
+    quantities = []
+    for command, arm in made.arms.items():
+        held: Any = made.holds[command]
+        box = drawn[f"{command.partition('.')[0]}.hold"].distribution
+        quantities.append(
+            Quantity(
+                arm.partition(".")[0],
+                "rad",
+                "The angle at which an arm comes to rest; an experiment holds it.",
+                Outcome(arm),
+                command,
+                float(box.low),
+                float(box.high),
+                float(held.function.weights[0]),
+            )
+        )
+    short = {arm: arm.partition(".")[0] for arm in made.arms.values()}
+    forces = sorted({cause for cause, _ in made.edges} - {*short})
+    pairs = [tuple(short[e] for c, e in made.edges if c == force) for force in forces]
+    return Apparatus(
+        World(made.task).given(made.plan),
+        tuple(quantities),
+        {"policy": None, "steps": made.steps},
+        300,
+        f"{n} arms with servos; each follows its own set point and the angles of other arms.",
+        independent=False,
+        edges=tuple((short[c], short[e]) for c, e in made.edges if c in short),
+        confounded=tuple((one, other) for one, other in pairs),
+    )
+
+
+def network(rng: np.random.Generator, knobs: Knobs) -> Apparatus:
+    """Draw masses on a random network of springs; an episode is one physics step."""
+    task = Springs(max(6, knobs.variables), int(rng.integers(2**31)))
+    names = sorted(task.masses)
+    near = {(task.masses[i], task.masses[j]) for i, j in task.pairs}
+    places, speeds = [], []
+    for name in names:
+        at, speed = f"{name}.position", f"{name}.velocity"
+        doc = "Where it begins; an experiment puts it there."
+        places.append(Quantity(at, "m", doc, Outcome(at, "first"), at, -0.5, 0.5))
+        speeds.append(Quantity(speed, "m/s", "After 0.02 s, from rest.", Outcome(speed)))
+    given = {one.name: Draw(Box(-0.3, 0.3)) for one in places}
+    together = {"*.position": Shift(Draw(Box(-0.3, 0.3)), shared=True)} if knobs.hidden else None
+    return Apparatus(
+        World(task).given(given),
+        (*places, *speeds),
+        {"policy": None, "steps": 1, "nature": together},
+        120,
+        f"{len(names)} masses on rails, with springs between some of them.",
+        edges=tuple(
+            (f"{a}.position", f"{b}.velocity") for a, b in sorted(near | {*map(_turned, near)})
+        ),
+        own=tuple((f"{n}.position", f"{n}.velocity") for n in names),
+    )
+
+
+def _turned(pair: Edge) -> Edge:
+    return pair[1], pair[0]
+
+
+# --- physics with causes that do not act on one another -------------------------------------------
+
+
+class Rig(NamedTuple):
+    """A model with causes that vary by themselves.
+
+    Attributes:
+        xml: Returns the model, of a law and three drawn numbers around 1.
+        causes: Unit, lowest and highest value by variable.
+        reads: Outcomes, with their units.
+        seconds: Length of an episode [s], in four control steps.
+        doc: A sentence.
+    """
+
+    xml: Callable[[str, Floats], str]
+    causes: Mapping[str, tuple[str, float, float]]
+    reads: Mapping[str, str]
+    seconds: float
+    doc: str
+
+
+def _springs(law: str, k: Floats) -> str:
+    stiffness = {"cubic": f"0.5 0 {30 * k[0]:.4f}"}.get(law, f"{6 * k[0]:.4f}")
+    damping = {"square": f"0.05 {2 * k[1]:.4f}"}.get(law, f"{0.8 * k[1]:.4f}")
+    dry = 0.4 * k[2] if law == "dead zone" else 0.0
+    joint = f'type="slide" axis="1 0 0" stiffness="{stiffness}" damping="{damping}"'
+    return f"""<mujoco model="springs"><option timestep="0.01" gravity="0 0 0"/><worldbody>
+<body name="left"><joint name="left" {joint} frictionloss="{dry:.4f}"/>
+<geom type="sphere" size="0.05" mass="0.5" contype="0" conaffinity="0"/></body>
+<body name="right" pos="1 0 0"><joint name="right" {joint} frictionloss="{dry:.4f}"/>
+<geom type="sphere" size="0.05" mass="0.5" contype="0" conaffinity="0"/></body></worldbody>
+<tendon><fixed name="spring" stiffness="{4 * k[2]:.4f}"><joint joint="left" coef="1"/>
+<joint joint="right" coef="-1"/></fixed></tendon></mujoco>"""
+
+
+RIGS: Mapping[str, Rig] = {
+    "springs": Rig(
+        _springs,
+        {
+            "left.mass": ("kg", 0.2, 1.5),
+            "right.mass": ("kg", 0.2, 1.5),
+            "spring.stiffness": ("N/m", 1.0, 9.0),
+            "left.velocity": ("m/s", 0.3, 2.0),
+            "right.velocity": ("m/s", 0.3, 2.0),
+        },
+        {"left.position": "m", "right.position": "m"},
+        1.2,
+        "Two masses on springs, coupled by a spring, begin with a speed.",
+    ),
+}
+
+
+def rig(name: str, rng: np.random.Generator, knobs: Knobs) -> Apparatus:
+    """Make a rig; a hidden common cause moves all of its causes."""
+    made, k = RIGS[name], rng.uniform(0.7, 1.4, 3)
+    ties, follows, quantities = [Exogenous(name="driver", distribution=Box(-1.0, 1.0))], {}, []
+    for cause, (unit, low, high) in made.causes.items():
+        ties.append(Exogenous(name=f"own.{cause}", distribution=Box(-1.0, 1.0)))
+        half = 0.5 * (high - low)
+        common = 0.7 * float(rng.choice([-1.0, 1.0])) if knobs.hidden else 0.0
+        weights = (half * common, half * (1.0 - abs(common)))
+        law = Linear(weights=weights, intercept=low + half)
+        follows[cause] = Mechanism(law, parents=("driver", f"own.{cause}"))
+        quantities.append(Quantity(cause, unit, "", Outcome(cause, "first"), cause, low, high))
+    for i in range(knobs.distractors):
+        name_of = f"lamp{i}.brightness"
+        ties.append(Exogenous(name=name_of, unit="cd", distribution=Box(0.0, 1.0)))
+        quantities.append(Quantity(name_of, "cd", "", Outcome(name_of), name_of, 0.0, 1.0))
+    for what, unit in made.reads.items():
+        quantities += [
+            Quantity(f"{what}.{how}", unit, "", Outcome(what, how))
+            for how in ("final", "mean", "max")
+        ]
+    expose = [cause for cause in made.causes if not cause.endswith(".velocity")]
+    dt = made.seconds / 4
+    task = ModelTask(
+        made.xml(knobs.law, k), expose=expose, ties=ties, control_dt=dt, seconds=made.seconds
+    )
+    outcomes = [f"{what}.{how}" for what in made.reads for how in ("final", "mean", "max")]
+    return Apparatus(
+        World(task).given(follows),
+        tuple(quantities),
+        {"policy": None, "steps": 4},
+        64,
+        f"{made.doc} {LAWS[knobs.law].capitalize()}.",
+        edges=tuple((cause, what) for cause in made.causes for what in outcomes),
+    )
+
+
+WORLDS: Mapping[str, tuple[Callable[[np.random.Generator, Knobs], Apparatus], str]] = {
+    "equations": (equations, "A random acyclic model of equations."),
+    "servo": (servos, "Arms whose servos follow one another."),
+    "network": (network, "Masses on a random network of springs, for one step."),
+    **{name: (partial(rig, name), made.doc) for name, made in RIGS.items()},
+}

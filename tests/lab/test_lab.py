@@ -1,0 +1,170 @@
+"""Facts about laboratories: certified questions, tools that refuse, scores and replays."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from scm_world import lab
+from scm_world.errors import ScmWorldError
+from scm_world.lab.expressions import evaluate
+
+
+def test_a_question_is_answered_by_the_solver_and_by_no_trivial_answer() -> None:
+    """The certificate is repeated by the same tools at another level."""
+    asked = lab.question("effect", "equations", seed=3, level="L4")
+    assert asked.certificate is not None
+    assert asked.certificate["solver"] >= 0.95 > 0.2 >= max(asked.certificate["trivial"].values())
+    room = lab.play("ideal", asked)
+    assert room.score is not None
+    assert room.score["score"] >= 0.95
+    assert lab.Question.of(asked.spec).digest == asked.digest
+
+
+HOSTILE: tuple[tuple[str, Any], ...] = (
+    ("observe", {"n": 0}),
+    ("observe", {"n": -5}),
+    ("observe", {"n": 10**9}),
+    ("observe", {"n": 2.5}),
+    ("observe", {"n": "all"}),
+    ("observe", {"n": True}),
+    ("observe", {"n": None}),
+    ("observe", {"m": 3}),
+    ("observe", [3]),
+    ("experiment", {}),
+    ("experiment", {"do": {}}),
+    ("experiment", {"do": None}),
+    ("experiment", {"do": "x0 = 1"}),
+    ("experiment", {"do": {"no_such": 1.0}}),
+    ("experiment", {"do": {"x0": float("nan")}}),
+    ("experiment", {"do": {"x0": float("inf")}}),
+    ("experiment", {"do": {"x0": 1e300}}),
+    ("experiment", {"do": {"x0": "1"}}),
+    ("experiment", {"do": {"x0": True}}),
+    ("experiment", {"do": {"x0": None}}),
+    ("experiment", {"do": {"x0": [1.0, 0.0]}}),
+    ("experiment", {"do": {"x0": [0.0, 0.5, 1.0]}}),
+    ("experiment", {"do": {"x0": []}}),
+    ("experiment", {"do": {"x0": {"a": 1}}}),
+    ("experiment", {"do": {"h0": 1.0}}),
+    ("experiment", {"do": {"x0": 1.0}, "n": -1}),
+    ("experiment", {"do": {"x0": 1.0}, "n": 100_000}),
+    ("experiment", {"do": {"x0": 1.0}, "at": -1}),
+    ("experiment", {"do": {"x0": 1.0}, "at": 10**6}),
+    ("experiment", {"do": {"x0": 1.0}, "seed": 1}),
+    ("submit", {}),
+    ("submit", {"answer": "__import__('os').getcwd()"}),
+    ("submit", {"answer": "__import__('os').system('true')", "confidence": 0.5}),
+    ("submit", {"answer": "9**9**9", "confidence": 0.5}),
+    ("submit", {"answer": "x0.__class__", "confidence": 0.5}),
+    ("submit", {"answer": "(" * 500 + ")" * 500, "confidence": 0.5}),
+    ("submit", {"answer": "1", "confidence": 1.5}),
+    ("submit", {"answer": "1", "confidence": float("nan")}),
+    ("submit", {"answer": 1.0, "confidence": 0.5}),
+    ("submit", {"answer": ["1"] * 10**5, "confidence": 0.5}),
+    ("note", {"text": "x" * 10**6}),
+    ("note", {"text": 3}),
+    ("__init__", {"question": None}),
+    ("_run", {"do": {}, "at": 0, "n": 1}),
+    ("save", {"path": "anything"}),
+    ("no_such_tool", {}),
+)
+
+
+@pytest.fixture(scope="module")
+def law() -> lab.Question:
+    """A question about a law of equations."""
+    return lab.question("law", "equations", seed=1)
+
+
+def test_hostile_calls_cost_and_change_nothing(law: lab.Question) -> None:
+    """Each is refused with a reason; afterwards the run is that of a new laboratory."""
+    room, fresh = lab.Laboratory(law), lab.Laboratory(law)
+    for tool, arguments in HOSTILE:
+        said = room.call(tool, arguments)
+        assert [*said] == ["refused"], (tool, arguments)
+        assert said["refused"]
+    assert (room.spent, room.calls, room.score) == (0, [], None)
+    assert room.observe(3) == fresh.observe(3)
+
+
+def test_calls_of_many_threads_do_not_spend_more_than_the_budget(law: lab.Question) -> None:
+    """Of many calls at once as many are answered as the budget has."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    room = lab.Laboratory(law)
+    with ThreadPoolExecutor(8) as pool:
+        said = [*pool.map(lambda _: room.call("observe", {"n": 150}), range(20))]
+    answered = sum("columns" in one for one in said)
+    assert answered == law.budget // 150
+    assert room.spent == 150 * answered
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "__import__('os')",
+        "9**9**9",
+        "x.real",
+        "[x]",
+        "x if x else 1",
+        "lambda: 1",
+        "x**y",
+        "f(x)",
+        "'a'",
+        "True",
+        "x == 1",
+        "sin()",
+        "sin(x, x)",
+        "exp(x=1)",
+        "x" + "+x" * 400,
+        "",
+        "x;x",
+    ],
+)
+def test_expressions_are_arithmetic_only(text: str) -> None:
+    """Everything else is refused."""
+    with pytest.raises(ScmWorldError):
+        evaluate(text, {"x": [1.0]})
+
+
+def test_expressions_have_the_values_of_python() -> None:
+    """Also with names that have dots."""
+    x = np.array([0.5, 2.0])
+    found = evaluate("2 * a.b ** 3 - max(a.b, 1) / exp(-a.b)", {"a.b": x})
+    np.testing.assert_allclose(found, 2 * x**3 - np.maximum(x, 1.0) / np.exp(-x))
+
+
+def test_a_saved_run_is_repeated_to_the_bit_and_a_changed_one_is_found(
+    law: lab.Question, tmp_path: Path
+) -> None:
+    """A replay says which call differs."""
+    path = lab.play("ideal", law).save(tmp_path / "run.json")
+    assert lab.replay(path) == []
+    run = json.loads(path.read_text())
+    run["calls"][1]["result"]["remaining"] += 1
+    path.write_text(json.dumps(run))
+    assert lab.replay(path)[0].startswith("call 1")
+
+
+def test_two_processes_make_the_same_questions_and_a_key_makes_others() -> None:
+    """Digests cover the description and the answer."""
+    program = (
+        "from scm_world import lab\n"
+        "print(lab.question('effect', 'equations', 5).digest)\n"
+        "print(lab.question('effect', 'equations', 5, key='secret').digest)\n"
+    )
+    runs = [
+        subprocess.run(  # noqa: S603 # our own text
+            [sys.executable, "-c", program], capture_output=True, text=True, check=True
+        ).stdout.split()
+        for _ in range(2)
+    ]
+    assert runs[0] == runs[1]
+    assert len({*runs[0]}) == 2
