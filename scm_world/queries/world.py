@@ -559,9 +559,9 @@ class World(Planned, _System, Questions, metaclass=_Opener):
 
         Candidates are ranked by linearisations over all of them. The first ones are fitted, and
         compared with one another and with the world as it is. Those that are predicted to be far
-        worse than the best are not fitted; the table has the predictions for them. Close ones are searched as thoroughly as ``fit`` does. A large
-        sensitivity is no explanation: a parameter explains a deviation if some value of it
-        reproduces the recording.
+        worse than the best are not fitted; the table has the predictions for them. Close ones are
+        searched as thoroughly as ``fit`` does. A large sensitivity is no explanation: a parameter
+        explains a deviation if some value of it reproduces the recording.
 
         Args:
             recording: See ``fit``.
