@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from scm_world.env import check as check
     from scm_world.errors import ScmWorldError as ScmWorldError
     from scm_world.fit import Deviation as Deviation
+    from scm_world.fit import Diagnosis as Diagnosis
     from scm_world.fit import Fit as Fit
     from scm_world.geometry.hulls import load_hull as load_hull
     from scm_world.queries import SCM as SCM
@@ -54,7 +55,7 @@ _NAMES = {
     "discovery": "discover",
     "env": "ScmWorldEnv check",
     "errors": "ScmWorldError",
-    "fit": "Deviation Fit",
+    "fit": "Deviation Diagnosis Fit",
     "geometry.hulls": "load_hull",
     "queries": "SCM Laboratory Outcome Plan World do verify",
     "tasks": "ModelTask StepTask Task TriFingerTask make_task",
@@ -89,3 +90,5 @@ for _task in ("reaching", *_BLOCKS.split(), "general", "model"):  # the last one
             order_enforce=False,  # it refuses steps before a reset itself
             disable_env_checker=True,  # tests check it; wrappers would hide compute_reward
         )
+if "scm_world/Lab-v0" not in gymnasium.registry:
+    gymnasium.register("scm_world/Lab-v0", "scm_world.lab.environment:LabEnv", order_enforce=False)

@@ -10,6 +10,7 @@ from typer.core import TyperGroup
 
 from scm_world.cli import console
 from scm_world.cli.data import collect, discover, sweep, triplets, verify
+from scm_world.cli.lab import serve
 from scm_world.cli.options import command
 from scm_world.cli.policies import clone, evaluate, explain, train
 from scm_world.cli.systems import (
@@ -80,3 +81,14 @@ COMMANDS: tuple[Callable[..., None], ...] = (
 for _function in COMMANDS:
     _command = command(_function)
     app.command(_function.__name__.rstrip("_"), help=_command.__doc__)(_command)
+
+laboratories = typer.Typer(
+    name="lab",
+    no_args_is_help=True,
+    help="Laboratories for agents: certified causal questions.\n\n"
+    "Example: scm-world lab serve effect --mcp",
+)
+for _function in (serve,):
+    _command = command(_function)
+    laboratories.command(_function.__name__, help=_command.__doc__)(_command)
+app.add_typer(laboratories)

@@ -514,6 +514,7 @@ def fit(
     thin: options.NotNegative = 0,
     held_out: options.Amount = 0.0,
     predict: options.Words = None,
+    diagnose: bool = False,
     suggest: options.NotNegative = 0,
     steps: Annotated[int | None, typer.Option(min=2, show_default="the longest run's")] = None,
     limits: Annotated[list[str] | None, typer.Option(metavar="NAME=LOW,HIGH")] = None,
@@ -549,6 +550,8 @@ def fit(
         thin: Every which row is used, 1 for all; 0 for as many as the motion needs.
         held_out: Share of the rows at the end of each run that are predicted, not fitted.
         predict: Another recording, which is predicted by the fit and by the unfitted world.
+        diagnose: Whether to try standard terms that the system lacks, such as backlash or the lag
+            of a sensor, on what the fit leaves; Ctrl-C ends it with those that were tried.
         suggest: Number of further experiments that are suggested; their commands are written.
         steps: Control steps of a suggested experiment.
         limits: Range that suggested experiments keep, such as '*.velocity=-2,2', besides those of
@@ -587,6 +590,7 @@ def fit(
             predict, request, suggest = None, {}, 0
         predictions = {other: found.predict(other, **names) for other in predict or ()}
         other = found.counterfactual(request, at=at, run=run, seed=asked.seed) if request else None
+        diagnosis = found.diagnose(progress=tell) if diagnose else None
         try:
             if suggest:
                 experiments = found.suggest(suggest, steps=steps, limits=ranges, seed=asked.seed)
@@ -596,6 +600,7 @@ def fit(
     console.say(shown, *(() if parameters else found.remarks))
     if parameters:
         console.frame(combinations, title="identifiable")
+    console.say(*([] if diagnosis is None else [diagnosis]))
     console.say(*(f"{path}: {prediction}" for path, prediction in predictions.items()))
     if found.held_out is not None:
         predictions["held out"] = found.held_out
@@ -616,6 +621,7 @@ def fit(
         explains=found.explains,
         remarks=found.remarks,
         replay=found.replay.to_dict("records"),
+        diagnosis=[] if diagnosis is None else diagnosis.table.to_dict("records"),
         predictions={name: one.table.to_dict("records") for name, one in predictions.items()},
         starts=[experiment.start for experiment in experiments],
     )

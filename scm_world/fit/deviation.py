@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 TIE = 6.0  # largest difference of the BIC of explanations that a recording cannot tell apart
 STEPS = STEP, 0.5, -0.5  # scaled steps of slopes; wide ones show a parameter without effect near
 KEPT = 0.5  # least predicted gain of a set that is fitted, relative to the largest
-FEWEST = 2  # sets that are fitted at least
 SEVERAL = 6  # the first ones, which are fitted for such a gain although another one explains all
 MANY = 12  # sets that are tried while none explains the recording: predictions are not certain then
 ALIKE = 0.2  # share of what a candidate explains that its place is taken without, at most
@@ -240,7 +239,7 @@ class _Comparison:
         try:
             self._compare()
             best = self._found().chosen
-            played = self._search.played(self._minima[best].at.scaled)
+            played = self._search.played(self._minima[best].at, self._minima[()].at)
         except KeyboardInterrupt:
             return replace(self._found(), untested=(), stopped=True)
         self._fits[best] = replace(self._fits[best], played=played)
@@ -361,7 +360,7 @@ class _Comparison:
             alike = {*around} > {*parts[names]} and left < ALIKE * (without - predicted[around][0])
             likely = bic[names] < lowest + margin or (first and gains[names] >= KEPT * most > 0.0)
             likely = likely or alike
-            if not (likely or place < (0 if around else FEWEST) or (open_ and first)):
+            if not (likely or (open_ and first)):
                 continue
             begin, enough = self._minima[around], ABANDON * least
             how: dict[str, Any] = {"thorough": False, "enough": enough}

@@ -15,6 +15,7 @@ from scm_world._arguments import typed, whole_number
 from scm_world._types import Floats, Integers
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.fit.design import PROBES, Experiment, suggested, unseen
+from scm_world.fit.diagnosis import Diagnosis, diagnosed
 from scm_world.fit.prediction import Prediction, predicted
 from scm_world.fit.problem import (
     SHORT,
@@ -52,6 +53,7 @@ from scm_world.fit.targets import (
 )
 from scm_world.fit.units import check_units
 from scm_world.geometry.rotations import aligned
+from scm_world.queries.progress import Progress
 from scm_world.queries.world import World
 from scm_world.runs.canvas import PALETTE, blank, styled
 from scm_world.tasks.model import ModelTask
@@ -473,6 +475,21 @@ class Fit:
         randomises by what was not determined. A delay is not among them.
         """
         return posterior_of(self.targets, self.scaled, self.spread)
+
+    @typed
+    def diagnose(self, *, progress: Progress | None = None) -> Diagnosis:
+        """Find out what kind of error of the model leaves the residuals.
+
+        Standard terms are added to the world one at a time, and fitted together with the
+        parameters: gain, offset and lag of each sensor, delay of each command, Coulomb friction,
+        one that falls with speed or grows with the torque, viscous damping, a spring, a torque
+        offset, saturation, backlash and a flexible joint. The extended BIC compares them. They are
+        tried in about 1000 rows, in windows that are spread over the recording.
+
+        Args:
+            progress: Called after each term. After Ctrl-C, the terms that were tried are returned.
+        """
+        return diagnosed(self, progress)
 
     @typed
     def save(self, path: str | Path) -> None:

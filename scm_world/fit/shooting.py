@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from typing import Self, final
 
 import numpy as np
@@ -51,6 +52,22 @@ SPEEDS = {"position": "velocity", "cartesian_position": "linear_velocity"} | TUR
 
 
 @final
+@dataclass(frozen=True)
+class Law:
+    """A command that follows from the present state, and from the other commands.
+
+    Attributes:
+        command: Name of the action.
+        parents: Names of numbers of the world that it follows from.
+        function: Of the commands, shape (n, n_actions), and of these numbers, (n,) each.
+    """
+
+    command: str
+    parents: tuple[str, ...]
+    function: Callable[..., Floats]
+
+
+@final
 class Shooting(Simulator):
     """Simulates windows of some runs in a batch of twins, from any start states.
 
@@ -58,13 +75,20 @@ class Shooting(Simulator):
         world: The world; it is not changed.
         measured: The recording.
         targets: The fitted numbers.
+        law: A command that no recording has, in each control step.
     """
 
-    def __init__(self, world: World, measured: Measurements, targets: Sequence[Target]) -> None:
+    def __init__(
+        self,
+        world: World,
+        measured: Measurements,
+        targets: Sequence[Target],
+        law: Law | None = None,
+    ) -> None:
         what = "a fit, whose sensitivities are differences of paired runs,"
         world.require_exact(what, independent=True)
         self.world, self.runs, self.columns = world, measured.runs, measured.columns
-        self.targets, self._open = tuple(targets), ExitStack()
+        self.targets, self._open, self._law = tuple(targets), ExitStack(), law
         self._names = tuple(dict.fromkeys(c.variable for c in measured.recorded))
         segments = sum(-(-len(run.instants) // SHORT) for run in self.runs)
         n = min(ROWS, 2 * segments * (2 + len(targets)))
@@ -375,7 +399,9 @@ class Shooting(Simulator):
 
         Before the measurements of a step, ``before`` is called with the number of the step.
         """
-        steps, size = np.full(len(self._batch), -1), self._batch.world(0).compiled.n_actions
+        compiled, law = self._batch.world(0).compiled, self._law
+        where, actions, size = compiled.where, compiled.actions, compiled.n_actions
+        steps = np.full(len(self._batch), -1)
         for row, sent in commands.items():
             steps[row] = len(sent)
         seen = np.empty((int(steps.max()) + 1, len(self._batch), len(self.columns)))
@@ -388,6 +414,10 @@ class Shooting(Simulator):
                     now[row] = sent if sent.ndim == 1 else sent[-1]
                     if sent.ndim > 1:
                         within[row] = sent
+                if law is not None:
+                    for table, rows in self._batch.by_structure(np.flatnonzero(going)):
+                        of = (table.numbers[rows, where[name].start] for name in law.parents)
+                        now[rows, actions[law.command].start] = law.function(now[rows], *of)
                 self._batch.advance(now, going, within)
             if before is not None:
                 before(step)

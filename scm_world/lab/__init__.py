@@ -1,6 +1,7 @@
 """Laboratories for agents: certified causal questions, tools, and scores without a judge."""
 
 from scm_world.lab.agents import AGENTS, certify, play
+from scm_world.lab.environment import LabEnv
 from scm_world.lab.laboratory import Laboratory, replay, scores, tools
 from scm_world.lab.questions import KINDS, LEVELS, Question, offers, question
 from scm_world.lab.worlds import LAWS, WORLDS, Knobs
@@ -12,6 +13,7 @@ __all__ = [
     "LEVELS",
     "WORLDS",
     "Knobs",
+    "LabEnv",
     "Laboratory",
     "Question",
     "certify",
