@@ -329,6 +329,12 @@ class Minima:
         apart = (one.at.scaled for one in good if not one.like(best, active, discount))
         return best._replace(others=tuple(apart))
 
+    def continued(self, active: Sequence[int], best: Result) -> Result:
+        """Search a minimum from that of almost the same recording, in whole windows if it can."""
+        if not best.joined:
+            return self.found(active, best)
+        return self._settled([*active], best, 0.0)
+
     def descended(self, active: Sequence[int], best: Result, other: Minimum) -> Result:
         """Return the minimum that is reached from the start states of other parameters' minimum.
 

@@ -42,6 +42,7 @@ from scm_world.variables import Rotations
 from scm_world.world import Simulation
 
 ROWS = 32  # worlds that are stepped together
+MOST_ROWS = 128  # the same of a long recording
 LOST = b"lost"  # in place of the parameters of a world whose state was lost
 LIFT = 10.0  # [m] between free bodies while their shapes change
 TINY = 1e-9  # change of the measurements by a scaled unit that is none, in their spread
@@ -91,7 +92,8 @@ class Shooting(Simulator):
         self.targets, self._open, self._law = tuple(targets), ExitStack(), law
         self._names = tuple(dict.fromkeys(c.variable for c in measured.recorded))
         segments = sum(-(-len(run.instants) // SHORT) for run in self.runs)
-        n = min(ROWS, 2 * segments * (2 + len(targets)))
+        tasks = segments * (2 + len(targets))  # of a linearisation, about
+        n = min(MOST_ROWS, max(ROWS, tasks // 2), 2 * tasks)
         together = twins_of(world).together(n, self._names, cores())
         self._batch = self._open.enter_context(together)
         self._known: list[dict[str, Floats]] = [{} for _ in range(len(self._batch))]
@@ -402,18 +404,17 @@ class Shooting(Simulator):
         compiled, law = self._batch.world(0).compiled, self._law
         where, actions, size = compiled.where, compiled.actions, compiled.n_actions
         steps = np.full(len(self._batch), -1)
+        given = np.zeros((max(map(len, commands.values())), len(self._batch), size))
         for row, sent in commands.items():
             steps[row] = len(sent)
-        seen = np.empty((int(steps.max()) + 1, len(self._batch), len(self.columns)))
+            given[: len(sent), row] = sent if sent.ndim == 2 else sent[:, -1]
+        parted = {row: sent for row, sent in commands.items() if sent.ndim > 2}
+        seen = np.empty((len(given) + 1, len(self._batch), len(self.columns)))
         for step in range(len(seen)):
             going = steps >= step
             if step:
-                now, within = np.zeros((len(self._batch), size)), dict[int, Floats]()
-                for row in np.flatnonzero(going).tolist():
-                    sent = commands[row][step - 1]
-                    now[row] = sent if sent.ndim == 1 else sent[-1]
-                    if sent.ndim > 1:
-                        within[row] = sent
+                now = given[step - 1]
+                within = {row: sent[step - 1] for row, sent in parted.items() if going[row]}
                 if law is not None:
                     for table, rows in self._batch.by_structure(np.flatnonzero(going)):
                         of = (table.numbers[rows, where[name].start] for name in law.parents)
