@@ -347,12 +347,13 @@ class Fit:
     def confounded(self) -> tuple[tuple[str, ...], ...]:
         """Groups of parameters that the recording cannot tell apart, or does not determine.
 
-        They are the undetermined ones of each undetermined combination, and the others alone.
+        They are the undetermined ones of each undetermined combination, and the others alone, in
+        the order of the table.
         """
         rows, table = self.identifiable, self.table
         left = [*table.parameter[~table.determined]]
         groups = [
-            tuple(n for n in names if n in left) for names in rows.parameters[~rows.determined]
+            tuple(n for n in left if n in names) for names in rows.parameters[~rows.determined]
         ]
         alone = ((name,) for name in left if not any(name in names for names in groups))
         return tuple(dict.fromkeys((*filter(None, groups), *alone)))
@@ -421,9 +422,17 @@ class Fit:
 
     @property
     def _replayed(self) -> tuple[float, float]:
-        """The errors of the replay of the fit and the unfitted world, in those of a constant."""
-        size = np.maximum(self.replay.constant, self.measured.least[: len(self.replay)])
-        one, other = (((self.replay[kind] / size) ** 2).mean() for kind in ("fit", "unfitted"))
+        """The errors of the replay of the fit and the unfitted world, in those of a constant.
+
+        A column that no run has twice, such as a known start, shows no motion: it does not count.
+        """
+        seen = np.max([np.isfinite(run.values).sum(axis=0) for run in self.runs], axis=0)
+        often = seen[: len(self.replay)] > 1
+        often |= not often.any()
+        size = np.maximum(self.replay.constant, self.measured.least[: len(self.replay)])[often]
+        one, other = (
+            ((self.replay[kind][often] / size) ** 2).mean() for kind in ("fit", "unfitted")
+        )
         return float(one) ** 0.5, float(other) ** 0.5
 
     @property
