@@ -267,7 +267,7 @@ class _Diagnosing:
     def _fitted(self, term: Term, begin: Fit, most: int) -> Fit:
         """Fit the numbers of the fit and those of a term, beginning from another fit."""
         world, fit = term.world, self._fit
-        measured, times = _recorded(self._measured, term)
+        measured, times = recorded_for(self._measured, term)
         with twin_of(world) as twin:
             ranges = any(name.endswith("range") for name in term.names)
             added = targets_of(twin, term.names, symmetric=ranges) if term.names else ()
@@ -306,7 +306,7 @@ class _Diagnosing:
                 at = gauss_newton(replace(squares, most=most), at.scaled, at.starts)
             none: dict[str, Any] = {"reach": None, "played": None, "later": None, "reading": ""}
             return replace(
-                *(fit,),
+                fit,
                 asked=world,
                 measured=measured,
                 targets=own,
@@ -503,7 +503,7 @@ def _stribeck(_: Floats, v: Floats, friction: Floats, drop: Floats, speed: Float
     return np.asarray(drop * friction * fast * np.sign(v))
 
 
-def _recorded(measured: Measurements, term: Term) -> tuple[Measurements, int]:
+def recorded_for(measured: Measurements, term: Term) -> tuple[Measurements, int]:
     """Return a recording for the world of a term, and how many of its control steps are one.
 
     Commands of motors that were added are 0.
@@ -517,6 +517,8 @@ def _recorded(measured: Measurements, term: Term) -> tuple[Measurements, int]:
             for one in (run.commands, run.before)
         )
         about: dict[str, Any] = {"commands": sent, "before": before}
+        if run.sent is not None:
+            about["sent"] = times * run.sent[0], np.pad(run.sent[1], wide)
         runs.append(replace(run, **about, instants=times * run.instants))
     columns = tuple(
         c._replace(variable=term.renamed.get(c.variable, c.variable)) for c in measured.columns
