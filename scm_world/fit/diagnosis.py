@@ -44,6 +44,7 @@ ROUGH = 1e-3  # precision of the squared residuals, relative
 STARTS = 3  # from which a term is searched
 SHORTLY, FEW, MANY = 3, 5, 15  # steps of a search: of each start, of a term, of a likely one
 LIKELY = 0.3  # of the largest gain, at which a search goes on
+LEAST = 3.0  # by which the logarithm of a number may be below its default, to begin with
 NEAR = 0.1, -0.1  # scaled numbers to begin with
 SENSORS = {"gain": NEAR, "offset": NEAR, "lag": (0.5, 2.0, -0.5)}
 PLAIN = {"frictionloss": "Coulomb friction", "damping": "viscous damping"}
@@ -293,6 +294,8 @@ class _Diagnosing:
             before = np.array([known.get(target.name, 0.0) for target in own])
             tried = [before]
             if not {target.name for target in own} <= {*known}:
+                least = [-LEAST if target.log else -np.inf for target in own]
+                before = np.maximum(before, least)  # at nearly 0, a logarithm changes nothing
                 moves = [[by.get(target.name, 0.0) for target in own] for by in term.begins]
                 tried = [problem.within(before + np.array(move)) for move in moves]
             shortly = replace(squares, most=SHORTLY if len(tried) > 1 else most)

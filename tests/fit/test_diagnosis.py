@@ -66,6 +66,11 @@ def stribeck(model: mujoco.MjModel, data: mujoco.MjData, *_: object) -> None:
     model.dof_frictionloss[0] = 0.03 + 0.06 * np.exp(-((data.qvel[0] / 0.5) ** 2))
 
 
+def delayed(_: mujoco.MjModel, data: mujoco.MjData, u: Any, step: int) -> None:
+    """Let a command act two control steps late."""
+    data.ctrl[0] = u[max(step - 2, 0)]
+
+
 @cache
 def world() -> sw.World:
     """Open the model, which has none of these terms."""
@@ -76,6 +81,7 @@ def world() -> sw.World:
     ("act", "late", "term", "value"),
     [
         (stribeck, 0, "Coulomb friction that falls with speed", ("hinge.stribeck_speed", 0.5)),
+        (delayed, 0, "delay of the command", ("motor.control_delay", 2.0)),
         (nothing, 2, "lag of the sensor", ("hinge.position lag", 2.0)),
     ],
 )
