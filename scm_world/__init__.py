@@ -90,3 +90,5 @@ for _task in ("reaching", *_BLOCKS.split(), "general", "model"):  # the last one
             order_enforce=False,  # it refuses steps before a reset itself
             disable_env_checker=True,  # tests check it; wrappers would hide compute_reward
         )
+if "scm_world/Lab-v0" not in gymnasium.registry:
+    gymnasium.register("scm_world/Lab-v0", "scm_world.lab.environment:LabEnv", order_enforce=False)

@@ -148,6 +148,8 @@ EXAMPLES: dict[str, tuple[str, ...]] = {  # each with arguments that make it sho
     "evaluation": (),
     "grasping": ("1",),
     "interventions": (),
+    "lab_agents": ("0", "2"),
+    "lab_chat": (),
     "learners": ("mujoco", "60"),
     "new_family": (),
     "own_backend": ("1", "10"),

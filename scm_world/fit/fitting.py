@@ -55,6 +55,7 @@ NEARLY = 0.25  # of a distance with its squares, from which the end of an interv
 RIDGE = 30.0  # times the error with all others known, of a parameter that others can replace
 PEELS = 3  # times that outliers are left out
 END = 0.1  # largest deviation of the root of the squares at an end of an interval, relative
+ROUGHLY = 5, 0.3, 3  # trials, deviation and steps where the model is wrong; see ``covering``
 OPEN = 300.0  # scaled distance up to which an end is searched
 ALMOST = 0.01  # precision of the squares along a profile, in those at the end of an interval
 PROFILE = 8  # largest number of steps at the end of an interval
@@ -115,7 +116,7 @@ def fit(
                         break
                     outliers += new
                     minima = Minima(minima.problem.without(new), search, tell)
-                    first = minima.found(range(number), first)
+                    first = minima.continued(range(number), first)
                     measured = minima.problem.measured
                 searched[rows] = first
                 if first.joined or attempt == len(usual):
@@ -198,7 +199,7 @@ def fitted(minima: Minima, active: Sequence[int], first: Result | None = None) -
         away = other[[*active]] - found.scaled
         margin = np.minimum(found.linear_reach, reach.max(axis=1))[:, None]
         reach = np.maximum(reach, np.array([-away, away]).T + margin)
-    return dataclasses.replace(found, reach=reach, played=minima.played(best.at.scaled))
+    return dataclasses.replace(found, reach=reach, played=minima.played(best.at))
 
 
 def covering(minima: Minima, found: Fit, others: Sequence[Minimum]) -> Fit:
@@ -267,6 +268,7 @@ def _profile(
     problem, linear, middle = minima.problem, found.linear_reach, best.at.scaled
     reach = np.repeat(np.where(linear < OPEN, linear, np.inf)[:, None], 2, axis=1)
     spread, alone = spread_of(found.sensitivities), np.linalg.norm(found.sensitivities, axis=0)
+    trials, end, most = (TRIALS, END, PROFILE) if found.explains else ROUGHLY
     ridge = (found.errors > DETERMINED) & (found.errors * alone > RIDGE * found.discount**0.5)
     for (place, i), side in itertools.product(enumerate(active), (0, 1)):
         if ridge[place]:
@@ -276,12 +278,12 @@ def _profile(
         others = [j for j in active if j != i]
         allowed = (linear[place] / found.errors[place]) ** 2 * found.discount
         rough = ALMOST * allowed / max(found.squares, TINY)
-        squares = LeastSquares(problem, problem.windows, best.noise, others, rough, PROFILE)
+        squares = LeastSquares(problem, problem.windows, best.noise, others, rough, most)
         least = 0.0 if best.smooth or found.errors[place] > DETERMINED else linear[place]
         far = min(max(linear[place], STEP), PRIOR)
         near, below, ends, above = 0.0, 0.0, np.inf, np.inf  # distances, and roots of the squares
         held = middle.copy(), best.at.starts  # at the nearer end
-        for _ in range(TRIALS):
+        for _ in range(trials):
             far = min(far, limit)
             scaled = middle.copy()
             scaled[active] += far * along
@@ -309,7 +311,7 @@ def _profile(
                 straight = near / max(root, NEARLY)
                 if ends < np.inf:
                     straight = near + (ends - near) * (1.0 - below) / (above - below)
-            if abs(root - 1.0) < END:
+            if abs(root - 1.0) < end:
                 ends = straight
                 break
             if ends <= least or (root < 1.0 and far >= min(limit, OPEN)):

@@ -867,8 +867,7 @@ def _runs(
             said += f": rows are usually {usual:.4g} s apart: give the world control_dt={usual:.4g}"
             unit = getattr(world.task, "time_unit", dt)
             if abs(usual / unit - round(usual / unit)) > FRACTION:
-                said += ", and its file a physics step that divides it, such as "
-                said += f"timestep={usual / np.ceil(usual / unit):.6g}"
+                said += f" and timestep={usual / np.ceil(usual / unit):.6g}, which divides it"
             _refuse([f"{said}, or resample the recording"], label)
         if np.isfinite(values[rows]).any():
             commands = np.repeat(np.clip(sent[rows[:-1]], low, high), repeats, axis=0)

@@ -69,6 +69,7 @@ DETERMINED = 0.25  # largest standard error of a determined combination: a share
 MISFIT = 1.5  # least residual that the noise does not explain, in standard deviations of it
 AWAY = 0.5  # of the spread of a state in the recording, at which it is far from rest
 WORSE = 1.1  # times the error of the unfitted world, with which a fit replays worse than it
+LEFT = 0.5  # share of the variance within windows that a fit leaves which does not follow them
 SHOWN = 5  # outliers that are named
 MAIN = 0.3  # least share of a parameter in a combination that is named
 DRAWN = 8  # columns of a picture
@@ -296,7 +297,7 @@ class Fit:
 
         linear = np.repeat(self.linear_reach[:, None], 2, axis=1)
         reach, rows = linear if self.reach is None else self.reach, []
-        unsure = self.ended or self.interrupted or self.worse
+        unsure = self.ended or self.interrupted or self.worse or self.aimless
         for target, number, (down, up) in zip(self.targets, self.scaled, reach, strict=True):
             value, ends = float(target.value(number)), np.array([number - down, number + up])
             open_ends = ends <= target.low, ends >= target.high
@@ -346,12 +347,13 @@ class Fit:
     def confounded(self) -> tuple[tuple[str, ...], ...]:
         """Groups of parameters that the recording cannot tell apart, or does not determine.
 
-        They are the undetermined ones of each undetermined combination, and the others alone.
+        They are the undetermined ones of each undetermined combination, and the others alone, in
+        the order of the table.
         """
         rows, table = self.identifiable, self.table
         left = [*table.parameter[~table.determined]]
         groups = [
-            tuple(n for n in names if n in left) for names in rows.parameters[~rows.determined]
+            tuple(n for n in left if n in names) for names in rows.parameters[~rows.determined]
         ]
         alone = ((name,) for name in left if not any(name in names for names in groups))
         return tuple(dict.fromkeys((*filter(None, groups), *alone)))
@@ -430,6 +432,25 @@ class Fit:
         """Whether the unfitted world replays the recording better than the fit and a constant."""
         fit, unfitted = self._replayed
         return unfitted < min(1.0, fit / WORSE)
+
+    @cached_property
+    def aimless(self) -> bool:
+        """Whether a constant replays the recording better, and windows do not follow it either.
+
+        The fit leaves half of the variance of the measurements around their mean in each window,
+        from which start states of their own keep chaos and impacts away.
+        """
+        if not self._replayed[0] > WORSE:
+            return False
+        (row, column), n = self.measured.cells, len(self.columns)
+        values, where = self.measured.values[row, column], self._windows * n + column
+        count = np.maximum(np.bincount(where), 1)
+        away = (values - (np.bincount(where, values) / count)[where]) ** 2
+        left, whole = (
+            by_column(column, squares, n)[0]
+            for squares in ((self.residual * self.noise[column]) ** 2, away)
+        )
+        return bool(np.mean(np.minimum(left / np.maximum(whole, 1e-300), 1.0)) > LEFT)
 
     @typed
     def predict(
@@ -560,19 +581,8 @@ class Fit:
             found.append(f"{len(self.outliers)} measurements were left out; fit.outliers has all")
         found += [self.reading] * bool(self.reading)
         groups = [tuple(n for n in names if n not in self.unseen) for names in self.confounded]
-        if self.interrupted:
-            groups = []
-        elif self.worse:
-            found.append(
-                "played from the first row, the unfitted world is nearer to the recording than the "
-                "fit: none of these values is determined"
-            )
-            groups = []
-        elif self._replayed[0] > WORSE:
-            found.append(
-                "played from the first row, a constant is nearer to the recording than the fit, "
-                "which does not predict that far ahead"
-            )
+        groups = [] if self.interrupted or self.worse or self.aimless else groups
+        found += self._played
         for names in filter(None, groups):
             alone = len(names) == 1
             said = "is not determined" if alone else "cannot be told apart"
@@ -618,11 +628,7 @@ class Fit:
     def _about_residuals(self) -> list[str]:
         """Sentences on what the model does not explain."""
         found = list[str]()
-        if self.shortened:
-            found.append(
-                f"windows of {WINDOW} rows do not explain the recording, those of {self.window} "
-                f"do: there are impacts or chaos, or something acts that is not modelled"
-            )
+        found += self._before
         for name, size in self.misfit.items():
             if size >= MISFIT:
                 said = f"the residuals of {name} are {size:.3g} times as large as its noise"
@@ -633,6 +639,43 @@ class Fit:
             found.append(
                 "the model leaves more than noise: intervals contain what each half of the "
                 "recording and windows of other lengths say"
+            )
+        return found
+
+    @property
+    def _played(self) -> list[str]:
+        """A sentence on a replay that is worse than that of the unfitted world or a constant."""
+        none = "none of these values is determined"
+        nearer = "is nearer to the recording than the fit"
+        words = ""
+        if self.interrupted:
+            return []
+        if self.worse:
+            words = f"the unfitted world {nearer}: {none}"
+        elif self.aimless:
+            words = f"a constant {nearer}, and windows do not follow it either: {none}"
+        elif self._replayed[0] > WORSE:
+            words = f"a constant {nearer}, which does not predict that far ahead"
+        return [f"played from the first row, {words}"] if words else []
+
+    @property
+    def _before(self) -> list[str]:
+        """Sentences on commands before the first row, and on windows that are shorter for them."""
+        late, found = 0.0, list[str]()
+        if self.asked is not None:
+            late = delays_of(self.asked, self.targets, self.scaled).max(initial=0.0)
+        if late > 0.0 and any(run.before is None for run in self.runs):
+            found.append(
+                "what was sent before the first row is not known, and the first command is "
+                f"assumed: if another one acted in the first {self.measured.control_dt * late:.3g} "
+                "s of a run, leave its measurements empty there"
+            )
+        if self.shortened:
+            found.append(
+                f"windows of {WINDOW} rows do not explain the recording, those of {self.window} "
+                f"do: there are impacts or chaos, or something acts that is not modelled"
+                + ", such as commands before the first row"
+                * bool(found)
             )
         return found
 

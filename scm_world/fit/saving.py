@@ -25,9 +25,12 @@ if TYPE_CHECKING:
 
 CLOSE = 1e-9  # largest relative difference of a number that was written and read again
 DRIVEN = ("gear", "kp", "kv", "gain", "bias", "forcerange", "ctrlrange", "timeconst")
+GENERAL = ("kp", "kv", "gain", "bias", "timeconst")  # what arrays of <general> have in MJCF
 STYLE = "body{font:16px/1.5 sans-serif;max-width:60em;margin:2em auto;padding:0 1em}"
 STYLE += "table{border-collapse:collapse}td,th{padding:.2em .8em;text-align:right}img{width:100%}"
 OTHER = r"<!--.*?-->|<(sensor|equality|keyframe)\b[^>/]*>.*?</\1>|<(?:site|camera|light)\b[^>]*>"
+MJCF = {"inertia": "diaginertia", "center_of_mass": "pos", "anchor": "pos"}  # other names there
+ANGLES = ("range", "ref", "springref")  # of hinges, in degrees unless the compiler says radians
 INSIDE = {"mass": ("mass", "value"), "damping": ("dynamics", "damping")}
 INSIDE["frictionloss"] = ("dynamics", "friction")  # of URDF: a child and its attribute
 
@@ -85,11 +88,15 @@ def _save_model(fit: Fit, path: Path) -> None:
         given = {n: np.array(twin[n]) for n in fit.asked.plan.at_start() if n in names}
         fitted = values_of(fit.targets, fit.scaled)
         values = given | {n: value for n, value in fitted.items() if not n.endswith(LATE)}
+        if tied := [name for name in values if name in {tie.name for tie in task.ties}]:
+            said = f"{', '.join(tied)} are variables of ties=, which a model file does not have"
+            raise ModelError([f"{said}: save values as .yaml, or fit the parameters they decide"])
         wanted = {name: np.array(values.get(name, twin[name])) for name in names}
+        units = {name: twin.model.declared(name).unit for name in values}
         system: Any = twin.composition.system
         mj = system.source.realized
     for name in values:
-        after = _with(after, name, wanted, mj)
+        after = _with(after, name, wanted, mj, units[name])
     try:
         write_whole(trial, after)
         about = {**task.given, "model": str(trial)}
@@ -107,12 +114,13 @@ def _save_model(fit: Fit, path: Path) -> None:
         if name not in read or not np.allclose(read[name], value, rtol=CLOSE, atol=1e-300)
     ]
     if lost:
-        problem = f"{', '.join(lost)} cannot be written in this file, which defines them elsewhere"
-        raise ModelError([f"{problem}: save values as .yaml"])
+        problem = f"{', '.join(lost)} cannot be written in this file: elements with their names do "
+        problem += "not have these attributes, but a default class, an included file or another one"
+        raise ModelError([f"{problem}; save values as .yaml, or name and write the elements there"])
     write_whole(path, after)
 
 
-def _with(text: str, name: str, values: Mapping[str, Floats], mj: Any) -> str:
+def _with(text: str, name: str, values: Mapping[str, Floats], mj: Any, unit: str) -> str:
     """Return the text of a model with other numbers of one parameter; as it is if it cannot be."""
     element, _, attribute = name.rpartition(".")
     hidden = re.sub(OTHER, lambda found: " " * len(found[0]), text, flags=re.S)
@@ -132,19 +140,54 @@ def _with(text: str, name: str, values: Mapping[str, Floats], mj: Any) -> str:
             child = f'<{child} {attribute}="{_written(values[name])}"/>'
             return f"{text[: tag.end()]}{child}{text[tag.end() :]}"
         tag = inner
-    elif attribute in ("mass", "inertia") and tag[1] == "body":
+    elif attribute in ("mass", "inertia", "center_of_mass") and tag[1] == "body":
         inner = re.compile(r"<inertial\b[^>]*>|</?body\b").search(hidden, tag.end())
         about = mj.body(element)
         if inner is None or not inner[0].startswith("<inertial"):
-            mass, inertia = (values.get(f"{element}.{n}") for n in ("mass", "inertia"))
-            parts = {"pos": about.ipos, "quat": about.iquat}
-            parts["mass"] = about.mass if mass is None else mass
-            parts["diaginertia"] = about.inertia if inertia is None else inertia
+            parts = {"pos": about.ipos, "quat": about.iquat, "mass": about.mass}
+            parts["diaginertia"] = about.inertia
+            for name in ("mass", "inertia", "center_of_mass"):
+                if (value := values.get(f"{element}.{name}")) is not None:
+                    parts[MJCF.get(name, name)] = value
             words = " ".join(f'{key}="{_written(numbers)}"' for key, numbers in parts.items())
             return f"{text[: tag.end()]}<inertial {words}/>{text[tag.end() :]}"
-        tag, attribute = inner, {"inertia": "diaginertia"}.get(attribute, attribute)
+        tag = inner
     first, last = tag.span()
-    return text[:first] + _replaced(text[first:last], attribute, values[name]) + text[last:]
+    changed, value = text[first:last], values[name]
+    if attribute == "inertia" and re.search(r"\bfullinertia\s*=", changed):
+        changed = re.sub(r"\s*\bfullinertia\s*=\s*([\"']).*?\1", "", changed, flags=re.S)
+        changed = _replaced(changed, "quat", mj.body(element).iquat)  # its principal axes
+    if changed.startswith("<general") and attribute in GENERAL:
+        for array, numbers in _general(element, values, mj).items():
+            changed = _replaced(changed, array, numbers)
+        return text[:first] + changed + text[last:]
+    degrees = re.search(r"<compiler\b[^>]*\bangle\s*=\s*[\"']radian", hidden) is None
+    if changed.startswith("<joint") and root and degrees and attribute in ANGLES and unit == "rad":
+        value = np.rad2deg(value)
+    changed = _replaced(changed, MJCF.get(attribute, attribute), value)
+    return text[:first] + changed + text[last:]
+
+
+def _general(element: str, values: Mapping[str, Floats], mj: Any) -> dict[str, Floats]:
+    """Return arrays of a ``<general>`` actuator that its gains, bias and time constants decide.
+
+    Source:
+        MuJoCo, *XML reference*, actuator/position and actuator/velocity: their gains and biases.
+    """
+    about = mj.actuator(element)
+    gain, bias = about.gainprm[:3].copy(), about.biasprm[:3].copy()
+    given = {name: values.get(f"{element}.{name}") for name in GENERAL}
+    kp, kv = given["kp"], given["kv"]
+    if kp is not None:
+        gain[0], bias[1] = kp, -kp
+    elif kv is not None:
+        gain[0] = kv
+    if kv is not None:
+        bias[2] = -kv
+    gain[0] = gain[0] if given["gain"] is None else given["gain"]
+    bias = bias if given["bias"] is None else np.asarray(given["bias"])
+    found = {"gainprm": gain[:1], "biasprm": bias}
+    return found if given["timeconst"] is None else found | {"dynprm": given["timeconst"]}
 
 
 def _tags(hidden: str, element: str, attribute: str) -> list[re.Match[str]]:
@@ -154,7 +197,7 @@ def _tags(hidden: str, element: str, attribute: str) -> list[re.Match[str]]:
     named = re.compile(rf"<(\w+)\b[^>]*?\bname\s*=\s*[\"']{re.escape(element)}[\"'][^>]*>")
     found = [*named.finditer(hidden)]
     bodies = [tag for tag in found if tag[1] in ("body", "link")]
-    if attribute in ("mass", "inertia"):
+    if attribute in ("mass", "inertia", "center_of_mass"):
         return bodies
     others = (tag for tag in found if tag not in bodies)
     return [tag for tag in others if (tag[1] in ("joint", "geom")) != (attribute in DRIVEN)]

@@ -42,6 +42,7 @@ from scm_world.variables import Rotations
 from scm_world.world import Simulation
 
 ROWS = 32  # worlds that are stepped together
+MOST_ROWS = 128  # the same of a long recording
 LOST = b"lost"  # in place of the parameters of a world whose state was lost
 LIFT = 10.0  # [m] between free bodies while their shapes change
 TINY = 1e-9  # change of the measurements by a scaled unit that is none, in their spread
@@ -91,9 +92,11 @@ class Shooting(Simulator):
         self.targets, self._open, self._law = tuple(targets), ExitStack(), law
         self._names = tuple(dict.fromkeys(c.variable for c in measured.recorded))
         segments = sum(-(-len(run.instants) // SHORT) for run in self.runs)
-        n = min(ROWS, 2 * segments * (2 + len(targets)))
+        tasks = segments * (2 + len(targets))  # of a linearisation, about
+        n = min(MOST_ROWS, max(ROWS, tasks // 2), 2 * tasks)
         together = twins_of(world).together(n, self._names, cores())
         self._batch = self._open.enter_context(together)
+        self._known: list[dict[str, Floats]] = [{} for _ in range(len(self._batch))]
         self._reset()
         first = self._batch.world(0)
         self.free = free_states(first)
@@ -141,8 +144,7 @@ class Shooting(Simulator):
         These are measured numbers and slopes of measured positions, and how a run is known to
         begin; the rest is simulated from the window before, or the default.
         """
-        world = self._batch.world(0)
-        begin(world, self.world)
+        world = self._begin(0)
         where, default = world.compiled.slices, world.vector.copy()
         known, moving = [], []  # measured numbers, and velocities of measured positions
         begun = [(self._places[i], i) for i in self._begins]
@@ -258,8 +260,12 @@ class Shooting(Simulator):
             vector[world.compiled.slices[name].start + 2] += LIFT * (1 + i)
         return vector
 
-    def _write(self, world: Simulation, scaled: Floats, setup: Iterable[tuple[str, float]]) -> None:
-        """Set the parameters of a twin for a set-up; it is in any state afterwards."""
+    def _write(self, row: int, scaled: Floats, setup: Iterable[tuple[str, float]]) -> None:
+        """Set the parameters of a twin for a set-up; it is in any state afterwards.
+
+        Those that it has from an earlier call are left as they are.
+        """
+        world, known = self._batch.world(row), self._known[row]
         if self._apart is not None:
             self._place(world, self._apart)
         usual = {name: values.copy() for name, values in self._usual.items()}
@@ -267,17 +273,22 @@ class Shooting(Simulator):
         for label, value in setup:
             name, place = self._places_of[label]
             values[name].reshape(-1)[place] = value
-        world.do(values)
+        new = {n: v for n, v in values.items() if n not in known or (v != known[n]).any()}
+        if new:
+            world.do(new)
+        self._known[row] = values
 
     def _key(self, run: int, scaled: Floats) -> bytes:
         """Return what tells the parameters of a run from others."""
         setup = tuple(self.runs[run].do.items())
         return scaled.tobytes() + (b"%d" % self._setups.index(setup)) * bool(self._usual)
 
-    def _copy(self, world: Simulation, other: Simulation) -> None:
+    def _copy(self, row: int, alike: int) -> None:
         """Set the parameters of a twin to those of another one."""
+        world, other = self._batch.world(row), self._batch.world(alike)
         world.backend.apply(Difference(parameters=other.backend.parameters(self._keys)))
         world.row.numbers[self._written] = other.row.numbers[self._written]
+        self._known[row] = self._known[alike] if self._known[row] else {}
 
     def _place(self, world: Simulation, vector: Floats) -> None:
         """Put a twin into a state, which measurements with noise may put out of its bounds."""
@@ -286,9 +297,15 @@ class Shooting(Simulator):
         world.state.vector[self._held] = vector[self._held]
         world.version += 1
 
+    def _begin(self, row: int) -> Simulation:
+        """Return a twin at the beginning of an episode, with the parameters of the world."""
+        begin(self._batch.world(row), self.world)
+        self._known[row] = {}
+        return self._batch.world(row)
+
     def _reset(self) -> None:
         for row in range(len(self._batch)):
-            begin(self._batch.world(row), self.world)
+            self._begin(row)
         self._set = [b""] * len(self._batch)  # the parameters of each row
 
     def _commands(self, run: RecordedRun, scaled: Floats, steps: Integers) -> Floats:
@@ -356,15 +373,15 @@ class Shooting(Simulator):
             window, scaled, vector = tasks[task]
             world = self._batch.world(row)
             if self._set[row] == LOST:
-                begin(world, self.world)
+                self._begin(row)
             run, key = self.runs[window.run], self._key(window.run, scaled)
             if self._set[row] != key:
                 alike = self._set.index(key) if key in self._set else None
                 self._set[row] = b"?"
                 if alike is None:
-                    self._write(world, scaled, run.do.items())
+                    self._write(row, scaled, run.do.items())
                 else:
-                    self._copy(world, self._batch.world(alike))
+                    self._copy(row, alike)
                 self._set[row] = key
             self._place(world, vector)
             since = run.instants[window.first]
@@ -387,18 +404,17 @@ class Shooting(Simulator):
         compiled, law = self._batch.world(0).compiled, self._law
         where, actions, size = compiled.where, compiled.actions, compiled.n_actions
         steps = np.full(len(self._batch), -1)
+        given = np.zeros((max(map(len, commands.values())), len(self._batch), size))
         for row, sent in commands.items():
             steps[row] = len(sent)
-        seen = np.empty((int(steps.max()) + 1, len(self._batch), len(self.columns)))
+            given[: len(sent), row] = sent if sent.ndim == 2 else sent[:, -1]
+        parted = {row: sent for row, sent in commands.items() if sent.ndim > 2}
+        seen = np.empty((len(given) + 1, len(self._batch), len(self.columns)))
         for step in range(len(seen)):
             going = steps >= step
             if step:
-                now, within = np.zeros((len(self._batch), size)), dict[int, Floats]()
-                for row in np.flatnonzero(going).tolist():
-                    sent = commands[row][step - 1]
-                    now[row] = sent if sent.ndim == 1 else sent[-1]
-                    if sent.ndim > 1:
-                        within[row] = sent
+                now = given[step - 1]
+                within = {row: sent[step - 1] for row, sent in parted.items() if going[row]}
                 if law is not None:
                     for table, rows in self._batch.by_structure(np.flatnonzero(going)):
                         of = (table.numbers[rows, where[name].start] for name in law.parents)
@@ -412,12 +428,11 @@ class Shooting(Simulator):
 
     def check(self, scaled: Floats) -> None:
         """Raise an ``InterventionError`` if the world refuses scaled parameters."""
-        world = self._batch.world(0)
         if self._set[0] == LOST:
-            begin(world, self.world)
+            self._begin(0)
         self._set[0] = b"?"
         for setup in self._setups:
-            self._write(world, scaled, setup)
+            self._write(0, scaled, setup)
 
     def replay(
         self,
@@ -456,7 +471,7 @@ class Shooting(Simulator):
             chunk = scaled[first : first + len(self._batch)]
             sent = {row: self._commands(run, one, steps) for row, one in enumerate(chunk)}
             for row, one in enumerate(chunk):
-                self._write(self._batch.world(row), one, run.do.items())
+                self._write(row, one, run.do.items())
                 # do() would begin the episode again
                 self._batch.world(row).advance(run.commands[0])
 

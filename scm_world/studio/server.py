@@ -19,6 +19,7 @@ from collections.abc import AsyncIterator, Callable
 from functools import cache
 from pathlib import Path
 from queue import SimpleQueue
+from socket import socket
 from typing import Any, final
 
 from starlette.applications import Starlette
@@ -264,6 +265,21 @@ class Studio:
         await session.serve(socket)
 
 
+def bind(config: Any) -> tuple[socket, str]:
+    """Return a socket at the address of a configuration of uvicorn, and the address as a URL.
+
+    Raises:
+        UnknownOption: The address is taken, or is not of this machine.
+    """
+    try:
+        bound = config.bind_socket()
+    except (OSError, SystemExit) as error:
+        allowed = (f"an address of this machine with a free port: {error}",)
+        raise UnknownOption("--port", f"{config.host}:{config.port}", allowed) from None
+    host = f"[{config.host}]" if ":" in config.host else config.host
+    return bound, f"http://{host}:{bound.getsockname()[1]}"
+
+
 def serve(
     spec: Spec,
     first: PipedProcess,
@@ -300,17 +316,12 @@ def serve(
         ws_max_size=LARGEST,
         ws_per_message_deflate=False,  # on one machine it costs more time than it saves
     )
-    try:
-        bound = config.bind_socket()
-    except (OSError, SystemExit) as error:
-        allowed = (f"an address of this machine with a free port: {error}",)
-        raise UnknownOption("--port", f"{host}:{port}", allowed) from None
+    bound, shown = bind(config)
     read = first.pipe.recv()
     if isinstance(read, Exception):
         raise read
     bound.listen()  # a page that is opened at once waits until the server answers
-    shown = f"[{host}]" if ":" in host else host
-    address = f"http://{shown}:{bound.getsockname()[1]}/" + (f"?token={token}" if token else "")
+    address = f"{shown}/" + (f"?token={token}" if token else "")
     server = uvicorn.Server(config)
 
     def end(*_: object) -> None:

@@ -211,6 +211,7 @@ class ModelTask(DeclaredTask):
         seconds: Length of an episode [s].
         control_dt: Length of a control step [s], a multiple of the physics step.
         frame_skip: The same in physics steps.
+        timestep: Physics step [s] in place of that of the file.
         fixed_base: Whether the root link of a URDF is fixed to the world.
         keyframe: Name, or number, of a keyframe of the file in which episodes begin. Its controls
             are the idle action, which holds a robot with servos there.
@@ -245,6 +246,7 @@ class ModelTask(DeclaredTask):
     seconds: float = 10.0
     control_dt: float | None = None
     frame_skip: int | None = None  # type: ignore[assignment] # filled in below
+    timestep: float | None = None
     fixed_base: bool = True
     keyframe: str | int | None = None
     exact: bool = True
@@ -261,7 +263,7 @@ class ModelTask(DeclaredTask):
         if isinstance(source, str | os.PathLike):  # else it cannot be made again from a file
             found = os.path.abspath(source) if os.path.exists(source) else str(source)
             self.given, self.is_named = {"model": found, **settings}, True
-        own = "expose fixed_base keyframe exact self_collision ground drop follow"
+        own = "expose fixed_base keyframe exact self_collision ground drop follow timestep"
         reading = {option: getattr(self, option) for option in own.split()}
         readouts = tuple(name for name in self.outcomes if isinstance(name, str))
         if isinstance(source, Model):
@@ -274,7 +276,9 @@ class ModelTask(DeclaredTask):
                 one_of("outcomes", name, known)
             self.system = source
         else:
-            self.system = read_model(source, readouts=readouts, **reading)
+            step = reading.pop("timestep")
+            about = {} if step is None else {"timestep": real_number("timestep", step)}
+            self.system = read_model(source, readouts=readouts, settings=about, **reading)
         self.channels = channels_of(self.system, self.noise, self.delay)
         if self.channels:
             self.system = with_held(self.system, self.channels)
@@ -304,7 +308,7 @@ class ModelTask(DeclaredTask):
         if steps < 1.0 - 1e-9 or abs(steps - round(steps)) > 1e-6:
             allowed = f"a multiple of the physics step, {self.time_unit:g} s"
             other = f"timestep={self.control_dt / max(math.ceil(steps), 1):.6g}"
-            advice = f"another one if the file's physics step divides it, such as {other}"
+            advice = f"this one with another physics step, which divides it: {other}"
             raise UnknownOption("control_dt", self.control_dt, (allowed, advice))
         return round(steps)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pandas as pd
 import pytest
@@ -128,11 +129,24 @@ def test_names_and_set_ups_that_contradict_each_other_are_refused(world: sw.Worl
 
 
 def test_clocks_that_are_no_multiple_of_the_physics_step_are_told_what_to_do() -> None:
-    """The advice works."""
+    """The advice works: the damping of plain MuJoCo with that physics step is found."""
     odd = TABLE.assign(time=[0.0, 0.003334, 0.006668])
-    with pytest.raises(ModelError, match=r"control_dt=0.003334, .* timestep=0.001667"):
+    with pytest.raises(ModelError, match=r"control_dt=0.003334 and timestep=0.001667"):
         read_recording(sw.World(PENDULUM), odd)
     with pytest.raises(UnknownOption, match=r"timestep=0\.001667"):
         sw.World(PENDULUM, control_dt=0.003334)
-    text = PENDULUM.replace("<worldbody>", '<option timestep="0.001667"/><worldbody>')
-    assert len(read_recording(sw.World(text, control_dt=0.003334), odd).runs) == 1
+    model = mujoco.MjModel.from_xml_string(PENDULUM)
+    model.opt.timestep, model.dof_damping[0] = 0.001667, 0.02
+    data, seen, sent = mujoco.MjData(model), list[float](), np.repeat([1.0, -1.0, 0.5, -0.5], 25)
+    for command in sent:
+        seen.append(float(data.qpos[0]))
+        data.ctrl[0] = command
+        mujoco.mj_step(model, data, 2)
+    with sw.World(PENDULUM, control_dt=0.003334, timestep=0.001667) as world:
+        assert world.substeps == 2
+        table = {"time": 0.003334 * np.arange(100), "motor.control": sent, "hinge.position": seen}
+        fit = world.fit(table, ["hinge.damping"], noise=1e-4)
+    assert fit.values["hinge.damping"] == pytest.approx(0.02, rel=1e-6)
+    assert fit.squares < 1e-6
+    with pytest.raises(UnknownOption, match="timestep"):
+        sw.World(PENDULUM, timestep="fast")

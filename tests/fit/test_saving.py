@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 import scm_world as sw
 from scm_world.cli.app import app
 from scm_world.errors import ModelError, UnknownOption
+from scm_world.variables import Derived
 
 MODEL = """<mujoco model="pendulum">
   <!-- not this one: <joint name="hinge" damping="9"/> -->
@@ -184,3 +185,114 @@ def test_an_environment_starts_with_what_the_recording_leaves_open() -> None:
         gears.append(float(inner.world["motor.gear"]))
     assert len({*gears, 1.0}) == 3
     env.close()
+
+
+def written(text: str, names: list[str], do: dict[str, Any], path: Path, **options: Any) -> Any:
+    """Return the values of a fit, and the file that it saves as plain MuJoCo reads it."""
+    world = sw.World(text, **options)
+    fit = world.fit(recorded(world, do), names, noise=1e-3)
+    fit.save(path)
+    return fit.values, mujoco.MjModel.from_xml_path(str(path))
+
+
+SERVOS = {
+    "position": ("2 0 0", "0 -2 -0.1", {"motor.kp": 3.0, "motor.kv": 0.15}),
+    "velocity": ("2 0 0", "0 0 -2", {"motor.kv": 3.0}),
+    "other": ("2 0 0", "0.1 -1 -0.2", {"motor.gain": 3.0, "motor.bias[1]": -1.5}),
+}
+
+
+@pytest.mark.parametrize("kind", SERVOS)
+def test_gains_of_general_actuators_are_their_arrays(tmp_path: Path, kind: str) -> None:
+    """Gain and bias are written where the element has them, or beside those of its class."""
+    gain, bias, do = SERVOS[kind]
+    own = f'biastype="affine" gainprm="{gain}" biasprm="{bias}"'
+    motor = '<motor name="motor" joint="hinge" gear="1 0 0" ctrlrange="-1 1"/>'
+    general = f'<general name="motor" joint="hinge" ctrlrange="-1 1" {own}/>'
+    classes = f'<default class="servo"><general {own}/></default>'
+    inherited = MODEL.replace('armature="0.001"/>', f'armature="0.001"/>{classes}')
+    short = '<general name="motor" joint="hinge" ctrlrange="-1 1" class="servo"/>'
+    expose = ["*", *(["motor.gain", "motor.bias"] if kind == "other" else [])]
+    setting = {"motor.bias": [0.1, -1.5, -0.2]} if kind == "other" else {}
+    setting |= {name: value for name, value in do.items() if "[" not in name}
+    for text in (MODEL.replace(motor, general), inherited.replace(motor, short)):
+        assert text.count("<general") == text.count("affine") + text.count('class="servo"/>')
+        value, after = written(text, [*do], setting, tmp_path / "arm.xml", expose=expose)
+        found_gain, found_bias = after.actuator_gainprm[0, :3], after.actuator_biasprm[0, :3]
+        if kind == "position":
+            assert found_gain.tolist() == [value["motor.kp"], 0.0, 0.0]
+            assert found_bias.tolist() == [0.0, -value["motor.kp"], -value["motor.kv"]]
+        elif kind == "velocity":
+            assert found_gain.tolist() == [value["motor.kv"], 0.0, 0.0]
+            assert found_bias.tolist() == [0.0, 0.0, -value["motor.kv"]]
+        else:
+            assert found_gain.tolist() == [value["motor.gain"], 0.0, 0.0]
+            assert found_bias.tolist() == [0.1, value["motor.bias[1]"], -0.2]
+        for name, wanted in do.items():
+            assert value[name] == pytest.approx(wanted, rel=1e-3)
+
+
+@pytest.mark.parametrize("angle", ["", 'angle="degree"', 'angle="radian"'])
+def test_angles_are_written_in_the_unit_of_the_compiler(tmp_path: Path, angle: str) -> None:
+    """Where a spring rests, and the ends of a range: degrees, unless the compiler says radians."""
+    low, high, rest = (-20.0, 15.0, 5.0) if "radian" not in angle else (-0.4, 0.3, 0.1)
+    own = f'name="hinge" limited="true" range="{low} {high}" stiffness="1" springref="{rest}"'
+    text = MODEL.replace('name="hinge" axis', f"{own} axis")
+    text = text.replace("<default>", f"<compiler {angle}/><default>") if angle else text
+    before = mujoco.MjModel.from_xml_string(text)
+    do = {"hinge.springref": 0.3, "hinge.position": -0.3}
+    names = ["hinge.springref", "hinge.range[1]"]
+    value, after = written(text, names, do, tmp_path / "arm.xml", expose=["*", "hinge.range"])
+    assert after.qpos_spring[0] == pytest.approx(value["hinge.springref"], rel=1e-12)
+    assert after.jnt_range[0, 1] == pytest.approx(value["hinge.range[1]"], rel=1e-12)
+    assert after.jnt_range[0, 0] == pytest.approx(before.jnt_range[0, 0], rel=1e-12)
+    assert value["hinge.springref"] == pytest.approx(0.3, rel=0.02)
+    assert after.qpos_spring[0] != pytest.approx(before.qpos_spring[0], rel=1e-3)
+
+
+def test_a_full_inertia_becomes_its_principal_moments(tmp_path: Path) -> None:
+    """With the axes that MuJoCo found; the mass alone leaves it as it is. So does a class."""
+    whole = '<inertial pos="0 0.1 -0.3" mass="0.2" fullinertia=".01 .011 .003 .001 0 .0005"/>'
+    text = MODEL.replace('<body name="pole">', f'<body name="pole">{whole}')
+    before = mujoco.MjModel.from_xml_string(text)
+    path = tmp_path / "arm.xml"
+    value, after = written(text, ["pole.mass"], {"pole.mass": 0.3}, path)
+    assert after.body("pole").mass[0] == value["pole.mass"]
+    np.testing.assert_array_equal(after.body("pole").inertia, before.body("pole").inertia)
+    assert "fullinertia" in path.read_text()
+    expose = ["*", "pole.inertia", "pole.center_of_mass"]
+    usual = before.body("pole").inertia
+    do = {"pole.inertia": 1.5 * usual, "pole.center_of_mass": [0.0, 0.1, -0.35]}
+    names = ["pole.inertia", "pole.center_of_mass[2]"]
+    value, after = written(text, names, do, path, expose=expose)
+    scale = value["pole.inertia"] / usual.max()
+    np.testing.assert_allclose(after.body("pole").inertia, scale * usual, rtol=1e-9)
+    np.testing.assert_allclose(after.body("pole").iquat, before.body("pole").iquat, atol=1e-12)
+    assert after.body("pole").ipos.tolist() == [0.0, 0.1, value["pole.center_of_mass[2]"]]
+
+
+def test_elements_override_their_default_class(tmp_path: Path) -> None:
+    """Those that have a number of their own, and those that get one; the class stays."""
+    classes = '<default class="soft"><joint damping="0.5" frictionloss="0.01"/></default>'
+    text = MODEL.replace('armature="0.001"/>', f'armature="0.001"/>{classes}')
+    text = text.replace('name="hinge"', 'name="hinge" class="soft"')
+    names, do = ["hinge.damping", "hinge.frictionloss"], {"hinge.frictionloss": 0.02}
+    value, after = written(text, names, do, tmp_path / "arm.xml")
+    assert after.dof_damping[0] == value["hinge.damping"]
+    assert after.dof_frictionloss[0] == value["hinge.frictionloss"]
+    assert classes in (tmp_path / "arm.xml").read_text()
+
+
+def test_variables_of_ties_are_refused(tmp_path: Path) -> None:
+    """A model file does not have them."""
+
+    def weighed(density: float) -> float:
+        return 0.001 * density
+
+    density = sw.Exogenous(name="density", default=200.0, bounds=sw.Box(10.0, 1000.0))
+    mass = Derived(name="pole.mass", parents=("density",), mechanism=weighed)
+    world = sw.World(MODEL, ties=[density, mass], expose=["*", "density"])
+    fit = world.fit(recorded(world, {"density": 300.0}), ["density"], noise=1e-3)
+    with pytest.raises(ModelError, match=r"density are variables of ties=.*save values as \.yaml"):
+        fit.save(tmp_path / "arm.xml")
+    assert not [*tmp_path.iterdir()]

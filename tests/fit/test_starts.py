@@ -134,6 +134,30 @@ def test_a_fit_that_replays_worse_than_the_file_determines_nothing() -> None:
     assert "the unfitted world is nearer to the recording than the fit" in str(fit)
 
 
+def test_a_fit_that_follows_no_window_determines_nothing() -> None:
+    """A servo whose position was recorded with the other sign: a constant replays it better."""
+    text = """<mujoco><option timestep="0.002"/><worldbody><body name="pole">
+    <joint name="hinge" axis="0 1 0" damping="0.05"/>
+    <geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="0.2"/></body></worldbody>
+    <actuator><position name="servo" joint="hinge" kp="2" ctrlrange="-1.5 1.5"/></actuator>
+    </mujoco>"""
+    world, rng = sw.World(text), np.random.default_rng(1)
+    commands = np.repeat(rng.uniform(-1.0, 1.0, 11), 10)[:101]
+    made = world.rollout(commands[:100, None], steps=100)
+    position = 1e-3 * rng.normal(size=101) - made["hinge.position"]
+    recording = {"time": 0.02 * np.arange(101), "servo.control": commands}
+    fit = world.fit({**recording, "hinge.position": position}, ["pole.mass"])
+    assert fit.replay.fit[0] > 1.1 * fit.replay.constant[0]
+    left = 0.0
+    for first in range(0, 101, fit.window):
+        rows = slice(first, first + fit.window)
+        left += ((position[rows] - position[rows].mean()) ** 2).sum()
+    assert ((fit.residual * fit.noise[0]) ** 2).sum() > 0.5 * left
+    assert fit.aimless
+    assert not fit.table.determined.any()
+    assert "windows do not follow it either" in str(fit)
+
+
 def test_a_right_fit_replays_with_the_noise() -> None:
     """Its start velocity, which nobody measured, is no reason to doubt a fit of noise alone."""
     text = """<mujoco><worldbody><body name="pole"><joint name="hinge" axis="0 1 0" damping="0.01"/>
