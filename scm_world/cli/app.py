@@ -9,7 +9,7 @@ import typer
 from typer.core import TyperGroup
 
 from scm_world.cli import console, suites
-from scm_world.cli import lab as lab_commands
+from scm_world.cli import lab as labs
 from scm_world.cli.data import collect, discover, sweep, triplets, verify
 from scm_world.cli.options import command
 from scm_world.cli.policies import clone, evaluate, explain, train
@@ -87,10 +87,9 @@ COMMANDS: tuple[Callable[..., None], ...] = (
     *(discover, verify, check, graph, variables, do, effect, counterfactual, fit),
     *(collect, sweep, triplets, evaluate, explain, train, clone, studio, list_),
 )
-_OF_LABS = "list_ question run play replay serve"
 GROUPS: Mapping[typer.Typer, tuple[Callable[..., None], ...]] = {
     app: COMMANDS,
-    laboratories: tuple(getattr(lab_commands, name) for name in _OF_LABS.split()),
+    laboratories: (labs.list_, labs.question, labs.run, labs.play, labs.replay, labs.serve),
     suite: (suites.list_, suites.make, suites.score),
 }
 for _group, _functions in GROUPS.items():

@@ -550,7 +550,7 @@ class Question:
         query: The same as data.
         answer: The exact answer.
         scale: The error up to which an answer has score 1.
-        key: The secret of a private question.
+        seal: The key of ``digest``: of a private question, nobody can try answers against it.
         certificate: Scores of the solver and of trivial answers, and why draws were rejected.
     """
 
@@ -565,7 +565,7 @@ class Question:
     query: Mapping[str, Any] = field(repr=False)
     answer: Any = field(repr=False)
     scale: Any = field(repr=False)
-    key: str | None = field(default=None, repr=False)
+    seal: bytes = field(repr=False)
     certificate: Mapping[str, Any] | None = field(default=None, repr=False)
 
     @classmethod
@@ -627,8 +627,9 @@ class Question:
 
     @property
     def digest(self) -> str:
-        """HMAC-SHA256 of the description and the answer under the key, which hides the answer."""
-        return _mac([self.describe(), self.answer], self.key).hex()
+        """HMAC-SHA256 of the description and the answer."""
+        text = json.dumps([self.describe(), self.answer], sort_keys=True)
+        return hmac.new(self.seal, text.encode(), hashlib.sha256).hexdigest()
 
     def grade(self, answer: Any) -> float:
         """Return the score of an answer, in [0, 1].
@@ -646,11 +647,6 @@ def check_key(key: object) -> None:
         raise UnknownOption("key", type(key), allowed)
 
 
-def _mac(parts: Any, key: str | None) -> bytes:
-    text = json.dumps(parts, sort_keys=True)
-    return hmac.new((key or "").encode(), text.encode(), hashlib.sha256).digest()
-
-
 def made(
     kind: str, world: str, seed: int, level: str, knobs: Knobs, draw: int, key: str | None
 ) -> Question:
@@ -665,7 +661,8 @@ def made(
     one_of("level", level, tuple(LEVELS))
     seed, draw = whole_number("seed", seed, least=0), whole_number("draw", draw, least=0)
     check_key(key)
-    hashed = _mac([kind, world, seed, draw, asdict(knobs)], key)
+    told = json.dumps([kind, world, seed, draw, asdict(knobs)])
+    hashed = hmac.new((key or "").encode(), told.encode(), hashlib.sha256).digest()
     entropy = int.from_bytes(hashed[:7], "big")
     rng = np.random.default_rng([entropy, 0])
     bench = Bench(apparatus(world, rng, knobs), level, knobs, entropy)
@@ -682,7 +679,7 @@ def made(
         found.query,
         found.answer,
         found.scale,
-        key,
+        hmac.new((key or "").encode(), b"digest", hashlib.sha256).digest(),
     )
 
 
