@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
-from scm_world.cli import console
+from scm_world.cli import console, suites
 from scm_world.cli.data import collect, discover, sweep, triplets, verify
 from scm_world.cli.lab import serve
 from scm_world.cli.options import command
@@ -51,6 +51,16 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
+laboratories = typer.Typer(
+    name="lab",
+    no_args_is_help=True,
+    help="Laboratories for agents: certified causal questions.\n\n"
+    "Example: scm-world lab serve effect --mcp",
+)
+app.add_typer(laboratories)
+SUITE = "Benchmark suites: list them, make them anew, score answers. Example: scm-world suite list"
+suite = typer.Typer(no_args_is_help=True)
+app.add_typer(suite, name="suite", help=SUITE)
 
 
 def _version(wanted: bool) -> None:
@@ -78,17 +88,12 @@ COMMANDS: tuple[Callable[..., None], ...] = (
     *(discover, verify, check, graph, variables, do, effect, counterfactual, fit),
     *(collect, sweep, triplets, evaluate, explain, train, clone, studio, list_),
 )
-for _function in COMMANDS:
-    _command = command(_function)
-    app.command(_function.__name__.rstrip("_"), help=_command.__doc__)(_command)
-
-laboratories = typer.Typer(
-    name="lab",
-    no_args_is_help=True,
-    help="Laboratories for agents: certified causal questions.\n\n"
-    "Example: scm-world lab serve effect --mcp",
-)
-for _function in (serve,):
-    _command = command(_function)
-    laboratories.command(_function.__name__, help=_command.__doc__)(_command)
-app.add_typer(laboratories)
+GROUPS: Mapping[typer.Typer, tuple[Callable[..., None], ...]] = {
+    app: COMMANDS,
+    laboratories: (serve,),
+    suite: (suites.list_, suites.make, suites.score),
+}
+for _group, _functions in GROUPS.items():
+    for _function in _functions:
+        _command = command(_function)
+        _group.command(_function.__name__.rstrip("_"), help=_command.__doc__)(_command)

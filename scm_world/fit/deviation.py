@@ -24,14 +24,16 @@ if TYPE_CHECKING:
     import pandas as pd
 
 TIE = 6.0  # largest difference of the BIC of explanations that a recording cannot tell apart
-BROAD = 0.5  # scaled step of slopes that show a parameter without effect at its default
+STEPS = STEP, 0.5, -0.5  # scaled steps of slopes; wide ones show a parameter without effect near
 KEPT = 0.5  # least predicted gain of a set that is fitted, relative to the largest
-FEWEST = 2  # sets that are fitted at least
-MANY = 12  # the same while no fit explains the recording, so that predictions are not to be trusted
+SEVERAL = 6  # the first ones, which are fitted for such a gain although another one explains all
+MANY = 12  # sets that are tried while none explains the recording: predictions are not certain then
+ALIKE = 0.2  # share of what a candidate explains that its place is taken without, at most
 ABANDON = 4.0  # times the least squared residuals, above which a search is given up
 CLOSE = 1.5  # times the least squared residuals, below which a fit is searched thoroughly
 FEW = 3  # sets with parameters that are, at most
 TURNS = 3  # largest number of exchanges of start states
+SHOWN = 5  # candidates that are listed
 
 Names = tuple[str, ...]
 """The parameters of a set of candidates; none of them for the world as it is."""
@@ -52,10 +54,14 @@ class Deviation:
             and default of the one that deviates most. A linearisation predicts them, or the search
             was given up there, as they were far larger than the least ones although windows were
             cut into shorter ones.
+        untested: Candidates that change no measurement of the recording: nothing tests them.
+        stopped: Whether the search was stopped (Ctrl-C); the rest is what was known by then.
     """
 
     fits: Mapping[Names, Fit]
     screened: Mapping[Names, Screened]
+    untested: Names = ()
+    stopped: bool = False
 
     @cached_property
     def bic(self) -> dict[Names, float]:
@@ -154,7 +160,13 @@ class Deviation:
             said += (
                 "; more than noise is left: something else deviates, too, or a minimum was missed"
             )
-        rows = table[: max(5, len(best))]
+        if self.stopped:
+            said = f"stopped before all searches were done; so far: {said}"
+        if self.untested:
+            names = ", ".join(self.untested[:SHOWN])
+            names += f" and {len(self.untested) - SHOWN} more" * (len(self.untested) > SHOWN)
+            said += f"\nno measurement of this recording changes with {names}: no test is possible"
+        rows = table[: max(SHOWN, len(best))]
         rest = f"\n{len(table) - len(rows)} more candidates" * (len(rows) < len(table))
         if self.screened:
             rest += f"\n{len(self.screened)} of {len(table)} candidates were not fitted"
@@ -188,11 +200,13 @@ def explain(
     with Shooting(world, measured, targets) as shooting:
         problem = FitProblem(shooting, measured, targets, given, window)
         minima = Minima(problem, search)
+        first = minima.found((), thorough=False)
         if np.isnan(given).any():  # consecutive residuals differ by noise, little by deviations
-            plain = described(minima, (), minima.found((), thorough=False))
+            plain = described(minima, (), first)
             rough = np.fmin(problem.noise, plain.noise * plain.roughness)
             problem.know(np.where(np.isnan(given), rough, given))
-        return _Comparison(minima, most, progress).run()
+            first = minima.found((), first, thorough=False)
+        return _Comparison(minima, first, most, progress).run()
 
 
 @final
@@ -201,12 +215,13 @@ class _Comparison:
 
     Args:
         minima: Finds minima of the recording.
+        first: That of the world as it is.
         most: Largest number of candidates in a set.
-        progress: Called after each fit.
+        progress: Called after each linearisation and each search.
     """
 
-    def __init__(self, minima: Minima, most: int, progress: Progress | None) -> None:
-        self._most, self._progress = most, progress
+    def __init__(self, minima: Minima, first: Result, most: int, progress: Progress | None) -> None:
+        self._most, self._progress, self._done = most, progress, 0
         self._search, self._targets = minima, minima.problem.targets
         self._numbers: dict[str, list[int]] = {}
         for i, target in enumerate(self._targets):
@@ -215,10 +230,23 @@ class _Comparison:
         self._fits: dict[Names, Fit] = {}
         self._given_up: dict[Names, Screened] = {}
         self._screened: dict[Names, Screened] = {}
-        self._keep((), minima.found((), thorough=False))
+        self._acting = np.zeros(len(self._targets), dtype=np.bool_)
+        self._keep((), first)
         self._more = np.log(len(self._fits[()].residual))
 
     def run(self) -> Deviation:
+        """Compare the sets; a Ctrl-C ends the search, and what is known by then is returned."""
+        try:
+            self._compare()
+            best = self._found().chosen
+            played = self._search.played(self._minima[best].at, self._minima[()].at)
+        except KeyboardInterrupt:
+            return replace(self._found(), untested=(), stopped=True)
+        self._fits[best] = replace(self._fits[best], played=played)
+        self._report(0)
+        return self._found()
+
+    def _compare(self) -> None:
         """Fit sets that may be the best, and those that differ from the best in one candidate."""
         singles, seen = [(name,) for name in self._numbers], set[Names]()
         slopes, path = self._slopes(()), Names()
@@ -239,13 +267,17 @@ class _Comparison:
                 self._consider(best, self._slopes(best), fewer)
             if self._found().chosen == best:
                 self._search_thoroughly(best)
-        best = self._found().chosen
-        played = self._search.played(self._minima[best].at.scaled)
-        self._fits[best] = replace(self._fits[best], played=played)
-        return self._found()
 
     def _found(self) -> Deviation:
-        return Deviation(dict(self._fits), self._screened | self._given_up)
+        numbers = self._numbers.items()
+        untested = tuple(name for name, which in numbers if not self._acting[which].any())
+        return Deviation(dict(self._fits), self._screened | self._given_up, untested)
+
+    def _report(self, ahead: int) -> None:
+        """Report that a linearisation or search is done, and how many are ahead for now."""
+        self._done += 1
+        if self._progress is not None:
+            self._progress(self._done, self._done + ahead)
 
     def _set(self, names: Iterable[str]) -> Names:
         """Return the set of some candidates, in the order of all of them."""
@@ -262,18 +294,18 @@ class _Comparison:
         self._minima[names] = minimum
         self._fits[names] = described(self._search, self._active(names), minimum)
         self._screened.pop(names, None)
-        if self._progress is not None:
-            done, most = len(self._fits), len(self._numbers) * self._most
-            self._progress(min(done, most), most)
 
     def _slopes(self, names: Names) -> list[tuple[Floats, Floats, Floats]]:
         """Linearise at the minimum of a set, over a small and over wide steps.
 
         Over a small step, the friction of a joint that sticks has no effect.
         """
-        minimum, whole = self._minima[names], self._fits[names].explains
-        steps, linearised = (STEP, BROAD, -BROAD), self._search.linearised
-        return [linearised(minimum, step, whole=whole) for step in steps]
+        minimum, whole, found = self._minima[names], self._fits[names].explains, []
+        for ahead, step in enumerate(STEPS):
+            found.append(self._search.linearised(minimum, step, whole=whole))
+            self._acting |= found[-1][2].any(axis=0)
+            self._report(len(STEPS) - 1 - ahead + min(MANY, len(self._numbers)))
+        return found
 
     def _predicted(
         self, slopes: Sequence[tuple[Floats, Floats, Floats]], sets: Iterable[Names]
@@ -302,33 +334,50 @@ class _Comparison:
     def _consider(
         self, around: Names, slopes: Sequence[tuple[Floats, Floats, Floats]], sets: Iterable[Names]
     ) -> None:
-        """Fit sets that may be better than the best one, or cannot be told apart from it."""
+        """Fit sets that may be better than the best one, or cannot be told apart from it.
+
+        All sets are ranked by what is left in the linearisation. The first ones are fitted until
+        one of them explains the recording; from then on those whose BIC may be as low, and those
+        that take the place of a candidate of ``around`` with little more left.
+        """
         done = self._fits.keys() | self._given_up.keys()
         new = [names for names in dict.fromkeys(sets) if names not in done]
-        predicted = self._predicted(slopes, [around, *new])
+        parts = {names: self._set({*around} & {*names}) for names in new}
+        predicted = self._predicted(slopes, dict.fromkeys([around, *new, *parts.values()]))
         bic = {names: self._bic(names, size) for names, (size, _) in predicted.items()}
         gains = {names: bic[around] - bic[names] for names in new}
         most = max(gains.values(), default=0.0)
+        for names in new:
+            self._screened[names] = self._about(names, *predicted[names])
         for place, names in enumerate(sorted(new, key=bic.__getitem__)):
             least = min(fit.squares for fit in self._fits.values())
             lowest = min(self._bic(n, fit.squares) for n, fit in self._fits.items())
             margin = 0.0 if {*around} < {*names} else TIE
-            likely = bic[names] < lowest + margin or gains[names] >= KEPT * most > 0.0
-            active, (size, scaled) = self._active(names), predicted[names]
-            explained = any(map(_explains, self._fits.values()))
-            if likely or place < (0 if around else FEWEST) or (place < MANY and not explained):
-                begin, enough = self._minima[around], ABANDON * least
-                how: dict[str, Any] = {"thorough": False, "enough": enough}
-                minimum = self._search.found(active, begin, values=scaled, **how)
-                if minimum.loss <= enough:
-                    self._keep(names, minimum)
-                    continue
-                size, scaled = minimum.loss, minimum.at.scaled[active]
-            most = int(np.abs(scaled).argmax())
-            target = self._targets[active[most]]
-            value = float(target.value(scaled[most]))
-            about = size, len(active), target.name, value, target.default
-            (self._given_up if likely else self._screened)[names] = about
+            size, scaled = predicted[names]
+            open_ = not any(map(_explains, self._fits.values()))
+            first = place < (MANY if open_ else SEVERAL)
+            left, without = size - predicted[around][0], predicted[parts[names]][0]
+            alike = {*around} > {*parts[names]} and left < ALIKE * (without - predicted[around][0])
+            likely = bic[names] < lowest + margin or (first and gains[names] >= KEPT * most > 0.0)
+            likely = likely or alike
+            if not (likely or (open_ and first)):
+                continue
+            begin, enough = self._minima[around], ABANDON * least
+            how: dict[str, Any] = {"thorough": False, "enough": enough}
+            minimum = self._search.found(self._active(names), begin, values=scaled, **how)
+            if minimum.loss <= enough:
+                self._keep(names, minimum)
+            else:
+                at = minimum.at.scaled[self._active(names)]
+                kept = self._given_up if likely else self._screened  # those may be tried again
+                kept[names] = self._about(names, minimum.loss, at)
+            self._report(max(0, min(MANY, len(new)) - place - 1))
+
+    def _about(self, names: Names, size: float, scaled: Floats) -> Screened:
+        """Return what the table has of a set that is not fitted."""
+        active, most = self._active(names), int(np.abs(scaled).argmax())
+        target = self._targets[active[most]]
+        return size, len(active), target.name, float(target.value(scaled[most])), target.default
 
     def _search_thoroughly(self, best: Names) -> None:
         """Repeat the searches of the best and of the empty set, with each other's start states.
@@ -357,6 +406,7 @@ class _Comparison:
                     minimum = min(minimum, found, key=lambda one: one.loss)
                 if not turn:
                     minimum = self._search.repeated(active, minimum, same=same)
+                self._report(len(few))
                 if minimum is not before:
                     self._keep(names, minimum)
                 if minimum.loss < before.loss - SAME:

@@ -199,7 +199,7 @@ def fitted(minima: Minima, active: Sequence[int], first: Result | None = None) -
         away = other[[*active]] - found.scaled
         margin = np.minimum(found.linear_reach, reach.max(axis=1))[:, None]
         reach = np.maximum(reach, np.array([-away, away]).T + margin)
-    return dataclasses.replace(found, reach=reach, played=minima.played(best.at.scaled))
+    return dataclasses.replace(found, reach=reach, played=minima.played(best.at))
 
 
 def covering(minima: Minima, found: Fit, others: Sequence[Minimum]) -> Fit:

@@ -84,7 +84,8 @@ class Prediction:
 
     def __str__(self) -> str:
         count = len(self.windows.drop_duplicates(["run", "time"]))
-        said = f"{count} windows that do not overlap, predicted up to {self.ahead:.3g} s ahead: "
+        said = "a window" if count == 1 else f"{count} windows that do not overlap"
+        said += f", predicted up to {self.ahead:.3g} s ahead: "
         skill, low, high = self.table[["skill", "low", "high"]].iloc[-1]
         interval = f" [{low:.3g}, {high:.3g}]" * bool(np.isfinite(low))
         said += f"skill {skill:.3g}{interval}"

@@ -255,7 +255,7 @@ class FitProblem:
         self.known = np.isfinite(noise)
         self.noise = np.where(self.known, noise, measured.noise)
         self.reached: tuple[Floats, Sequence[Window], Sequence[Floats]] | None = None
-        self._last: tuple[Any, Any, Any] = (None, None, None)
+        self._last: dict[tuple[Window, bytes, bytes], Simulated] = {}
 
     def within(self, scaled: Floats) -> Floats:
         """Return scaled parameters within their ranges."""
@@ -294,20 +294,21 @@ class FitProblem:
         Returns:
             The paired simulations, 1 + p + k of each segment, and the steps, shape (p + k,).
         """
-        how = (*active,), k, step, of_states
-        asked = tuple(segments), scaled.tobytes(), np.array(starts).tobytes(), how
-        if self._last[0] != asked:  # independent of joints and noise
-            steps, unit, moved = self._steps(scaled, step, active), np.eye(len(scaled)), np.eye(k)
-            tasks = []
-            for segment, start in zip(segments, starts, strict=True):
-                tasks.append((segment, scaled, start))
-                tasks += [(segment, scaled + steps[i] * unit[i], start) for i in active]
-                around = [self.simulator.moved(start, of_states * one) for one in moved]
-                tasks += [(segment, scaled, other) for other in around]
-            sizes = np.concatenate([steps[list(active)], np.full(k, of_states)])
-            sizes[sizes == 0.0] = step
-            self._last = asked, self.simulator.simulate(tasks), sizes
-        return self._last[1], self._last[2]
+        steps, unit, moved = self._steps(scaled, step, active), np.eye(len(scaled)), np.eye(k)
+        tasks = list[tuple[Window, Floats, Floats]]()
+        for segment, start in zip(segments, starts, strict=True):
+            tasks.append((segment, scaled, start))
+            tasks += [(segment, scaled + steps[i] * unit[i], start) for i in active]
+            around = [self.simulator.moved(start, of_states * one) for one in moved]
+            tasks += [(segment, scaled, other) for other in around]
+        keys = [(one, by.tobytes(), start.tobytes()) for one, by, start in tasks]
+        new = {key: task for key, task in zip(keys, tasks, strict=True) if key not in self._last}
+        made = self.simulator.simulate([*new.values()]) if new else []
+        known = self._last | dict(zip(new, made, strict=True))
+        self._last = {key: known[key] for key in keys}  # the next call asks for many of them
+        sizes = np.concatenate([steps[list(active)], np.full(k, of_states)])
+        sizes[sizes == 0.0] = step
+        return [known[key] for key in keys], sizes
 
     def _steps(self, scaled: Floats, size: float, active: Sequence[int]) -> Floats:
         """Return the steps of finite differences: down, or small, where a range ends; else none."""

@@ -347,12 +347,13 @@ class Fit:
     def confounded(self) -> tuple[tuple[str, ...], ...]:
         """Groups of parameters that the recording cannot tell apart, or does not determine.
 
-        They are the undetermined ones of each undetermined combination, and the others alone.
+        They are the undetermined ones of each undetermined combination, and the others alone, in
+        the order of the table.
         """
         rows, table = self.identifiable, self.table
         left = [*table.parameter[~table.determined]]
         groups = [
-            tuple(n for n in names if n in left) for names in rows.parameters[~rows.determined]
+            tuple(n for n in left if n in names) for names in rows.parameters[~rows.determined]
         ]
         alone = ((name,) for name in left if not any(name in names for names in groups))
         return tuple(dict.fromkeys((*filter(None, groups), *alone)))

@@ -252,31 +252,37 @@ class Minima:
             scaled = self.problem.allowed(np.zeros(len(scaled)), scaled)
         return self._joined([*active], scaled, starts, self.problem.noise, 2, thorough, enough)
 
-    def played(self, scaled: Floats) -> Floats:
+    def played(self, at: Minimum, unfitted: Minimum | None = None) -> Floats:
         """Return how far runs that are played from their first row are from the measurements.
 
         Their start states are those of their first windows, as each world fits them best. It is
-        the root mean square of each column, with scaled parameters and without a fit, shape
-        (2, columns).
+        the root mean square of each column, at a minimum and without a fit, shape (2, columns).
+
+        Args:
+            at: The minimum of whole windows.
+            unfitted: That of the world as it is, if it was searched.
         """
         problem, plain = self.problem, np.ones(len(self.problem.measured.columns))
         runs, column = problem.measured.runs, problem.measured.cells[1]
-        first = [[one] for one in windows_of(runs, problem.window) if not one.first]
+        usual = windows_of(runs, problem.window)
+        first = [[one] for one in usual if not one.first]
         pairs = zip(problem.segments, self._guess, strict=True)
         guess = [start for segment, start in pairs if not segment.first]
         squares = LeastSquares(problem, first, problem.noise, ())
         windows = windows_of(runs, None)
 
-        def sizes(numbers: Floats) -> Floats:
-            starts = gauss_newton(squares, numbers, guess).starts
+        def sizes(numbers: Floats, near: Minimum | None) -> Floats:
+            begun = zip(usual, near.starts, strict=True) if near else ()
+            begin = [start for one, start in begun if not one.first] or guess
+            starts = gauss_newton(squares, numbers, begin).starts
             tasks = [(one, numbers, start) for one, start in zip(windows, starts, strict=True)]
             made = zip(windows, problem.simulator.simulate(tasks), strict=True)
             left = np.concatenate([problem.residual(one, it.values, plain) for one, it in made])
             return np.sqrt(np.divide(*by_column(column, left**2, len(plain))))
 
         if self._unfitted is None:
-            self._unfitted = sizes(np.zeros(len(scaled)))
-        return np.array([sizes(scaled), self._unfitted])
+            self._unfitted = sizes(np.zeros(len(at.scaled)), unfitted)
+        return np.array([sizes(at.scaled, at), self._unfitted])
 
     def repeated(
         self,

@@ -96,6 +96,7 @@ class Shooting(Simulator):
         n = min(MOST_ROWS, max(ROWS, tasks // 2), 2 * tasks)
         together = twins_of(world).together(n, self._names, cores())
         self._batch = self._open.enter_context(together)
+        self._known: list[dict[str, Floats]] = [{} for _ in range(len(self._batch))]
         self._reset()
         first = self._batch.world(0)
         self.free = free_states(first)
@@ -143,8 +144,7 @@ class Shooting(Simulator):
         These are measured numbers and slopes of measured positions, and how a run is known to
         begin; the rest is simulated from the window before, or the default.
         """
-        world = self._batch.world(0)
-        begin(world, self.world)
+        world = self._begin(0)
         where, default = world.compiled.slices, world.vector.copy()
         known, moving = [], []  # measured numbers, and velocities of measured positions
         begun = [(self._places[i], i) for i in self._begins]
@@ -260,8 +260,12 @@ class Shooting(Simulator):
             vector[world.compiled.slices[name].start + 2] += LIFT * (1 + i)
         return vector
 
-    def _write(self, world: Simulation, scaled: Floats, setup: Iterable[tuple[str, float]]) -> None:
-        """Set the parameters of a twin for a set-up; it is in any state afterwards."""
+    def _write(self, row: int, scaled: Floats, setup: Iterable[tuple[str, float]]) -> None:
+        """Set the parameters of a twin for a set-up; it is in any state afterwards.
+
+        Those that it has from an earlier call are left as they are.
+        """
+        world, known = self._batch.world(row), self._known[row]
         if self._apart is not None:
             self._place(world, self._apart)
         usual = {name: values.copy() for name, values in self._usual.items()}
@@ -269,17 +273,22 @@ class Shooting(Simulator):
         for label, value in setup:
             name, place = self._places_of[label]
             values[name].reshape(-1)[place] = value
-        world.do(values)
+        new = {n: v for n, v in values.items() if n not in known or (v != known[n]).any()}
+        if new:
+            world.do(new)
+        self._known[row] = values
 
     def _key(self, run: int, scaled: Floats) -> bytes:
         """Return what tells the parameters of a run from others."""
         setup = tuple(self.runs[run].do.items())
         return scaled.tobytes() + (b"%d" % self._setups.index(setup)) * bool(self._usual)
 
-    def _copy(self, world: Simulation, other: Simulation) -> None:
+    def _copy(self, row: int, alike: int) -> None:
         """Set the parameters of a twin to those of another one."""
+        world, other = self._batch.world(row), self._batch.world(alike)
         world.backend.apply(Difference(parameters=other.backend.parameters(self._keys)))
         world.row.numbers[self._written] = other.row.numbers[self._written]
+        self._known[row] = self._known[alike] if self._known[row] else {}
 
     def _place(self, world: Simulation, vector: Floats) -> None:
         """Put a twin into a state, which measurements with noise may put out of its bounds."""
@@ -288,9 +297,15 @@ class Shooting(Simulator):
         world.state.vector[self._held] = vector[self._held]
         world.version += 1
 
+    def _begin(self, row: int) -> Simulation:
+        """Return a twin at the beginning of an episode, with the parameters of the world."""
+        begin(self._batch.world(row), self.world)
+        self._known[row] = {}
+        return self._batch.world(row)
+
     def _reset(self) -> None:
         for row in range(len(self._batch)):
-            begin(self._batch.world(row), self.world)
+            self._begin(row)
         self._set = [b""] * len(self._batch)  # the parameters of each row
 
     def _commands(self, run: RecordedRun, scaled: Floats, steps: Integers) -> Floats:
@@ -358,15 +373,15 @@ class Shooting(Simulator):
             window, scaled, vector = tasks[task]
             world = self._batch.world(row)
             if self._set[row] == LOST:
-                begin(world, self.world)
+                self._begin(row)
             run, key = self.runs[window.run], self._key(window.run, scaled)
             if self._set[row] != key:
                 alike = self._set.index(key) if key in self._set else None
                 self._set[row] = b"?"
                 if alike is None:
-                    self._write(world, scaled, run.do.items())
+                    self._write(row, scaled, run.do.items())
                 else:
-                    self._copy(world, self._batch.world(alike))
+                    self._copy(row, alike)
                 self._set[row] = key
             self._place(world, vector)
             since = run.instants[window.first]
@@ -413,12 +428,11 @@ class Shooting(Simulator):
 
     def check(self, scaled: Floats) -> None:
         """Raise an ``InterventionError`` if the world refuses scaled parameters."""
-        world = self._batch.world(0)
         if self._set[0] == LOST:
-            begin(world, self.world)
+            self._begin(0)
         self._set[0] = b"?"
         for setup in self._setups:
-            self._write(world, scaled, setup)
+            self._write(0, scaled, setup)
 
     def replay(
         self,
@@ -457,7 +471,7 @@ class Shooting(Simulator):
             chunk = scaled[first : first + len(self._batch)]
             sent = {row: self._commands(run, one, steps) for row, one in enumerate(chunk)}
             for row, one in enumerate(chunk):
-                self._write(self._batch.world(row), one, run.do.items())
+                self._write(row, one, run.do.items())
                 # do() would begin the episode again
                 self._batch.world(row).advance(run.commands[0])
 

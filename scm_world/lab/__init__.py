@@ -4,6 +4,7 @@ from scm_world.lab.agents import AGENTS, certify, play
 from scm_world.lab.environment import LabEnv
 from scm_world.lab.laboratory import Laboratory, replay, scores, tools
 from scm_world.lab.questions import KINDS, LEVELS, Question, offers, question
+from scm_world.lab.suites import SUITES, Made, Suite, suite
 from scm_world.lab.worlds import LAWS, WORLDS, Knobs
 
 __all__ = [
@@ -11,16 +12,20 @@ __all__ = [
     "KINDS",
     "LAWS",
     "LEVELS",
+    "SUITES",
     "WORLDS",
     "Knobs",
     "LabEnv",
     "Laboratory",
+    "Made",
     "Question",
+    "Suite",
     "certify",
     "offers",
     "play",
     "question",
     "replay",
     "scores",
+    "suite",
     "tools",
 ]

@@ -33,6 +33,10 @@ DRAWS, PILOT = 40, 40
 """How many draws of a seed are tried, and units whose spread is that of a reading."""
 
 
+SHORTEST = 16
+"""The fewest characters of a key."""
+
+
 class Unusable(ModelError):
     """A draw that makes no question."""
 
@@ -270,7 +274,7 @@ def _graph(bench: Bench, rng: np.random.Generator) -> Made:
 
 def _grade_graph(answer: Any, question: Question) -> float:
     names, truth = list(question.bench.quantities), question.answer
-    given = _pairs(answer, "edges", names), _pairs(answer, "hidden", names)
+    given = graph_pairs(answer, "edges", names), graph_pairs(answer, "hidden", names)
     own = {tuple(edge) for edge in question.query["known"]}
     edges = [(c, e, 0) for c, e in given[0] if (c, e) not in own]
     true = [(c, e, 0) for c, e in truth["edges"]]
@@ -280,7 +284,8 @@ def _grade_graph(answer: Any, question: Question) -> float:
     return max(0.0, 1.0 - 2.0 * wrong / len(true))
 
 
-def _pairs(answer: Any, part: str, names: Sequence[str]) -> list[tuple[str, str]]:
+def graph_pairs(answer: Any, part: str, names: Sequence[str]) -> list[tuple[str, str]]:
+    """Return the pairs of one part of a graph that an agent gave; refuse another form."""
     found: Any = answer.get(part, ()) if isinstance(answer, Mapping) else None
     right = isinstance(found, list | tuple) and len(found) <= len(names) ** 2
     if not right or not {*answer} <= {"edges", "hidden"}:
@@ -543,6 +548,7 @@ class Question:
         query: The same as data.
         answer: The exact answer.
         scale: The error up to which an answer has score 1.
+        seal: The key of ``digest``: of a private question, nobody can try answers against it.
         certificate: Scores of the solver and of trivial answers, and why draws were rejected.
     """
 
@@ -557,6 +563,7 @@ class Question:
     query: Mapping[str, Any] = field(repr=False)
     answer: Any = field(repr=False)
     scale: Any = field(repr=False)
+    seal: bytes = field(repr=False)
     certificate: Mapping[str, Any] | None = field(default=None, repr=False)
 
     @classmethod
@@ -618,9 +625,9 @@ class Question:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the description and the answer."""
+        """HMAC-SHA256 of the description and the answer."""
         text = json.dumps([self.describe(), self.answer], sort_keys=True)
-        return hashlib.sha256(text.encode()).hexdigest()
+        return hmac.new(self.seal, text.encode(), hashlib.sha256).hexdigest()
 
     def grade(self, answer: Any) -> float:
         """Return the score of an answer, in [0, 1].
@@ -629,6 +636,13 @@ class Question:
             UnknownOption: The answer has another form.
         """
         return KINDS[self.kind].grade(answer, self)
+
+
+def check_key(key: object) -> None:
+    """Refuse a key that can be guessed: whoever has the description of a question could try it."""
+    if key is not None and not (isinstance(key, str) and len(key) >= SHORTEST):
+        allowed = (f"a secret text of at least {SHORTEST} characters", "None for public questions")
+        raise UnknownOption("key", type(key), allowed)
 
 
 def made(
@@ -642,8 +656,7 @@ def made(
     one_of("world", world, offers(kind))
     one_of("level", level, tuple(LEVELS))
     seed, draw = whole_number("seed", seed, least=0), whole_number("draw", draw, least=0)
-    if not (key is None or isinstance(key, str)):
-        raise UnknownOption("key", key, ("a text", "None for a public question"))
+    check_key(key)
     told = json.dumps([kind, world, seed, draw, asdict(knobs)])
     hashed = hmac.new((key or "").encode(), told.encode(), hashlib.sha256).digest()
     entropy = int.from_bytes(hashed[:7], "big")
@@ -662,6 +675,7 @@ def made(
         found.query,
         found.answer,
         found.scale,
+        hmac.new((key or "").encode(), b"digest", hashlib.sha256).digest(),
     )
 
 
@@ -684,8 +698,9 @@ def question(
             ``"explanation"``, ``"control"`` or ``"diagnosis"``.
         world: A name of ``WORLDS``.
         seed: Number of the question.
-        level: What an agent knows beforehand: ``"L1"`` to ``"L4"``.
-        key: A secret; the questions of a key cannot be made without it.
+        level: What an agent knows beforehand: ``"L1"`` to ``"L4"``. The world of a seed is the same
+            at each level.
+        key: A secret of at least 16 characters; its questions cannot be made without it.
         knobs: Values of ``Knobs``.
 
     Raises:

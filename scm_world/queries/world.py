@@ -557,11 +557,11 @@ class World(Planned, _System, Questions, metaclass=_Opener):
     ) -> Deviation:
         """Find which parameter accounts for the deviation of a recording from this world.
 
-        Candidates are fitted, and compared with one another and with the world as it is. Those that
-        a linearisation predicts to be far worse than the best are not fitted; the table has its
-        predictions for them. Close ones are searched as thoroughly as ``fit`` does. A large
-        sensitivity is no explanation: a parameter explains a deviation if some value of it
-        reproduces the recording.
+        Candidates are ranked by linearisations over all of them. The first ones are fitted, and
+        compared with one another and with the world as it is. Those that are predicted to be far
+        worse than the best are not fitted; the table has the predictions for them. Close ones are
+        searched as thoroughly as ``fit`` does. A large sensitivity is no explanation: a parameter
+        explains a deviation if some value of it reproduces the recording.
 
         Args:
             recording: See ``fit``.
@@ -576,7 +576,9 @@ class World(Planned, _System, Questions, metaclass=_Opener):
             columns: See ``fit``.
             ignore: See ``fit``.
             thin: See ``fit``.
-            progress: Called after each fit.
+            progress: Called after each linearisation and each search. Ctrl-C (an error
+                ``KeyboardInterrupt``) ends the search; what is known by then is returned, and says
+                so.
 
         Raises:
             Those of ``fit``.

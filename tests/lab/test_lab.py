@@ -158,7 +158,7 @@ def test_two_processes_make_the_same_questions_and_a_key_makes_others() -> None:
     program = (
         "from scm_world import lab\n"
         "print(lab.question('effect', 'equations', 5).digest)\n"
-        "print(lab.question('effect', 'equations', 5, key='secret').digest)\n"
+        "print(lab.question('effect', 'equations', 5, key='a secret of a test').digest)\n"
     )
     runs = [
         subprocess.run(  # noqa: S603 # our own text

@@ -14,7 +14,13 @@ from scm_world.runs.files import Location, located, write_whole
 if TYPE_CHECKING:
     import pyarrow as arrow
 
-KINDS = {"triplets": "pairs", "shard": "rows", "pictures": "pictures"}
+KINDS = {
+    "triplets": "pairs",
+    "shard": "rows",
+    "pictures": "pictures",
+    "questions": "questions",
+    "private": "private",
+}
 """The beginning of the names of files, and the name of their part of the dataset."""
 TYPES = {
     "int64": "cr:Int64",
@@ -52,7 +58,8 @@ def as_huggingface(folder: Location | str, **about: object) -> Location:
     ``croissant.json``, which ``mlcroissant`` reads. Data stay as they are.
 
     Args:
-        folder: With Parquet files; complete.
+        folder: With Parquet files, or with folders that have them, each a part of its own name;
+            complete.
         about: Properties of the dataset, as Croissant calls them: ``name``, ``description``,
             ``version``, and its recommended fields: ``license``, ``url``, ``creator``,
             ``datePublished`` and ``citeAs``.
@@ -81,9 +88,13 @@ def as_huggingface(folder: Location | str, **about: object) -> Location:
     card = [f"pretty_name: {json.dumps(about['name'])}"]
     card += [f"license: {json.dumps(about['license'])}"] if "license" in about else []
     distribution, records, configs = list[Any](), list[Any](), ["configs:"]
-    for kind, part in KINDS.items():
-        pattern = f"{kind}-*.parquet"
-        files = {file.name: file.read_bytes() for file in list[Location](place.glob(pattern))}
+    patterns = {part: f"{kind}-*.parquet" for kind, part in KINDS.items()}
+    for inner in sorted(list[Location](place.iterdir()), key=str):
+        patterns |= {inner.name: f"{inner.name}/shard-*.parquet"} if inner.is_dir() else {}
+    for part, pattern in patterns.items():
+        inside = "".join(pattern.rpartition("/")[:2])
+        found = list[Location](place.glob(pattern))
+        files = {inside + file.name: file.read_bytes() for file in found}
         if not files:
             continue
         format_ = {"encodingFormat": "application/x-parquet"}

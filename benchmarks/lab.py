@@ -1,0 +1,250 @@
+"""Measure laboratories: certified questions, their answers, agents by budget; write manifests.
+
+::
+
+    python -m benchmarks.lab questions --n 25  # of each kind: certificates and CPU time
+    python -m benchmarks.lab truth             # their answers, by an independent script
+    python -m benchmarks.lab agents --n 4      # curves of score by budget
+    python -m benchmarks.lab suites            # the manifests of physics-1 and lab-1
+
+The figures are in ``lab.json``. Questions are those of ``lab-1``, in the order of its parts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks import as_json
+from scm_world import lab
+from scm_world.discovery.learners.registry import learn
+from scm_world.lab import suites
+from scm_world.lab.questions import Question
+from scm_world.runs.pool import Pool
+
+HERE = Path(__file__).parent
+RESULTS = HERE / "lab.json"
+MANIFESTS = HERE.parent / "scm_world" / "lab" / "manifests"
+PER_PART = 25
+KNOBS: tuple[dict[str, Any], ...] = (
+    {},
+    {"law": "cubic"},
+    {"selection": True},
+    {"law": "square"},
+    {"noise": 0.1},
+)
+SOURCES = {
+    **{f"servo-{n}": f"servo:{n}" for n in (5, 10, 20)},
+    "servo-10-hidden": "servo:10:2",
+    **{f"springs-{n}": f"springs:{n}" for n in (5, 10, 20, 50)},
+    "boxes": "scm_world.lab.suites:boxes",
+    "pushing": "pushing",
+}
+TRIVIAL = ("empty", "bipartite", "correlation", "sort_regress")
+
+
+def recipes() -> dict[str, dict[str, Any]]:
+    """Return the recipes of ``lab-1``: 25 questions of each kind and level, and private ones."""
+    found, seed = dict[str, dict[str, Any]](), 0
+    for level in (*lab.LEVELS, None):
+        for kind in lab.KINDS:
+            recipe: dict[str, Any] = {
+                "kind": kind,
+                "worlds": [*lab.offers(kind)],
+                "knobs": [*KNOBS],
+            }
+            recipe |= {"seed": seed, "n": PER_PART}
+            recipe |= {"private": True} if level is None else {"level": level}
+            found[f"{kind}-{level or 'private'}"] = recipe
+            seed += PER_PART
+    return found
+
+
+# --- questions ------------------------------------------------------------------------------------
+
+
+def stronger(question: Question) -> dict[str, Any]:
+    """Return answers without an experiment that the certificate does not try."""
+    query = question.query
+    match question.kind:
+        case "control":
+            ends = question.bench.ends(query["cause"])
+            place = {share: ends[0] + share * (ends[1] - ends[0]) for share in (0.12, 0.88)}
+            return {f"at {share:.0%}": {query["cause"]: x} for share, x in place.items()}
+        case "explanation":
+            usual = query["usual"]
+            width = {name: float(np.ptp(question.bench.ends(name))) for name in usual}
+            far = {name: abs(query["set"][name] - usual[name]) / width[name] for name in usual}
+            return {"farthest": max(far, key=lambda name: far[name])}
+        case "graph":
+            names = [name for name, one in question.bench.quantities.items() if one.sets]
+            others = [name for name in question.bench.readable if name not in names] or names
+            known = {tuple(edge) for edge in query["known"]}
+            pairs = [[a, b] for a in names for b in others if a != b and (a, b) not in known]
+            return {"all pairs": {"edges": pairs}, "half": {"edges": pairs[::2]}}
+    return {}
+
+
+def asked(job: dict[str, Any]) -> dict[str, Any]:
+    """Make a certified question; return its spec, scores and the CPU seconds that it took."""
+    begin = time.process_time()
+    spec = {name: job[name] for name in ("kind", "world", "seed", "level")}
+    try:
+        made = lab.question(**spec, **job["knobs"])
+    except Exception as error:  # a seed without a question is a result
+        return {**job, "error": str(error)[:200], "seconds": time.process_time() - begin}
+    seconds = time.process_time() - begin
+    certificate = made.certificate or {}
+    more = {name: made.grade(answer) for name, answer in stronger(made).items()}
+    again = Question.of(made.spec)
+    return {
+        "spec": made.spec,
+        "seconds": seconds,
+        "rejected": len(certificate["rejected"]),
+        "ideal": certificate["solver"],
+        "trivial": {**certificate["trivial"], **more},
+        "same": again.digest == made.digest,
+        "digest": made.digest,
+    }
+
+
+def jobs(n: int) -> list[dict[str, Any]]:
+    """Return the first ``n`` questions of each kind, with the levels in turn."""
+    levels, found = [*lab.LEVELS], list[dict[str, Any]]()
+    for i in range(n):
+        for name, recipe in recipes().items():
+            if name.endswith(levels[i % len(levels)]):
+                found.append(suites._specs(recipe)[i // len(levels)])
+    return found
+
+
+def questions(n: int, workers: int, out: Path) -> None:
+    """Certify questions; write a row of each to a scratch file as it is ready."""
+    wanted = jobs(n)
+    with Pool("process" if workers > 1 else None, workers) as pool, out.open("w") as file:
+        for _, row in pool.run(asked, wanted):
+            file.write(json.dumps(row) + "\n")
+            file.flush()
+
+
+def table(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Summarise certified questions by kind."""
+    found, kinds = dict[str, Any](), defaultdict(list)
+    for row in rows:
+        kinds[row.get("spec", row)["kind"]].append(row)
+    for kind, of_kind in kinds.items():
+        good = [row for row in of_kind if "error" not in row]
+        names = sorted({name for row in good for name in row["trivial"]})
+        trivial = {n: [row["trivial"][n] for row in good if n in row["trivial"]] for n in names}
+        found[kind] = {
+            "questions": len(good),
+            "seeds without one": len(of_kind) - len(good),
+            "rejected draws": sum(row["rejected"] for row in good),
+            "CPU seconds": round(sum(row["seconds"] for row in of_kind), 1),
+            "ideal": round(float(np.mean([row["ideal"] for row in good])), 3),
+            "trivial": {name: round(float(np.mean(s)), 3) for name, s in trivial.items()},
+            "same without certifying": sum(row["same"] for row in good),
+        }
+    return found
+
+
+# --- manifests ------------------------------------------------------------------------------------
+
+
+def trivial_tables(recipe: dict[str, Any]) -> dict[str, float]:
+    """Return the scores of trivial learners on a table."""
+    rows, about = suites._table(recipe)
+    found = {}
+    for name in TRIVIAL:
+        graph = learn(name, rows.lagged() if rows.is_temporal else rows)
+        pairs = {tuple(n.split("@")[0].split("[")[0] for n in edge[:2]) for edge in graph.directed}
+        edges = [[a, b] for a, b in pairs if a != b]
+        found[name] = round(suites._overlap({"edges": edges}, about), 3)
+    every = [[a, b] for a in about["names"] for b in about["names"] if a != b]
+    return {**found, "all": round(suites._overlap({"edges": every}, about), 3)}
+
+
+def tables() -> dict[str, dict[str, Any]]:
+    """Return the recipes of ``physics-1``."""
+    return {
+        f"{name}-{data}": {
+            "kind": name,
+            "level": data,
+            "source": source,
+            "data": data,
+            "seed": 0,
+            "rows": 400 if name == "pushing" else 1000,
+            **({"contacts": True, "view": "step"} if name == "boxes" else {}),
+        }
+        for name, source in SOURCES.items()
+        for data in ("observational", "interventional", "paired")
+    }
+
+
+ABOUT = {
+    "lab-1": {
+        "title": "1,000 certified causal questions to laboratories of equations and physics.",
+        "measures": "Whether an agent with a budget of experiments finds graphs, effects, laws, "
+        "predictions under interventions, counterfactuals, explanations, controls and faults. "
+        "Levels L1 to L4 say less and less about the variables beforehand. A scripted solver "
+        "answers each question with the same tools and the same budget. 800 questions are public; "
+        "200 follow from a key.",
+        "limits": "Whoever has the package can compute the answer to a public question: the public "
+        "split measures an agent only while it has the tools alone. The worlds are small, the "
+        "solver knows the kind of each question, and a score says nothing of other worlds. The "
+        "world of a seed is the same at each level; here each question has another seed.",
+    },
+    "physics-1": {
+        "title": "Tables of servos, springs, boxes and a robot that pushes, with true graphs.",
+        "measures": "Whether a learner finds a graph from observational rows, interventional rows, "
+        "or pairs: the rows of 'paired' are the units of 'observational' under an intervention, "
+        "with the same noise. 'servo-10-hidden' has two forces without a column. Springs and boxes "
+        "have a row for each control step, and edges lead from one row to the next. The answer is "
+        "scored by F1 of directed edges, at any lag and without loops, and of pairs with a hidden "
+        "cause.",
+        "limits": "The graphs are those of simulated systems that are declared and verified by "
+        "experiments. A declared edge can be too weak to be seen in so few rows. Everybody can "
+        "compute the true graphs.",
+    },
+}
+
+
+def manifests(made: dict[str, Path]) -> None:
+    """Write the manifests, with hashes, draws and trivial scores of parts that were made."""
+    for name, parts in (("physics-1", tables()), ("lab-1", recipes())):
+        found = {"versions": suites._here()}
+        for part, recipe in parts.items():
+            path = made[name] / f"{part}.json" if name in made else None
+            if path is None or not path.exists() or recipe.get("private"):
+                continue
+            about = json.loads(path.read_text())["content"]
+            trivial = about.get("trivial") or trivial_tables(recipe)
+            draws = {"draws": about["draws"]} if "draws" in about else {}
+            recipe.update(sha256=about["sha256"], trivial=trivial, **draws)
+        text = as_json({**ABOUT[name], **found, "parts": parts}, 2)
+        (MANIFESTS / f"{name}.json").write_text(text + "\n")
+
+
+def main() -> None:
+    """Run one part."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("part", choices=("questions", "truth", "agents", "suites"))
+    parser.add_argument("--n", type=int, default=25)
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--rows", type=Path, default=HERE / "lab_questions.jsonl")
+    parser.add_argument("--made", type=Path, nargs="*", default=[])
+    given = parser.parse_args()
+    if given.part == "questions":
+        questions(given.n, given.workers, given.rows)
+    if given.part == "suites":
+        manifests({path.name: path for path in given.made})
+
+
+if __name__ == "__main__":
+    main()
