@@ -4,11 +4,11 @@
 
     python benchmarks/fit.py --runs 17
 
-Six models that others wrote (dm_control, Gymnasium, pybullet_data) get known deviations; runs of
-them with sensor noise are fitted by worlds that do not know these. Then a payload of an arm with
-stiff servos is fitted before and after a suggested experiment, and one recording is fitted by
-``mujoco.sysid``, too, where that can be imported (``pip install mujoco[sysid]``). It prints what it
-finds and writes it as JSON.
+Twelve models that others wrote (dm_control, Gymnasium, pybullet_data) get known deviations; runs
+of them with sensor noise are fitted by worlds that do not know these. One recording of each of six
+is fitted from ten random defaults. Then a payload of an arm with stiff servos is fitted before and
+after a suggested experiment, and one recording is fitted by ``mujoco.sysid``, too, where that can
+be imported (``pip install mujoco[sysid]``). It prints what it finds and writes it as JSON.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import json
 import re
 import time
 import warnings
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +47,11 @@ class Case:
         steps: Control steps of a recording.
         share: Share of the range of the commands, which are drawn at random.
         start: Where a recording begins.
-        delay: Delay of the commands of the recorded system [s], a multiple of 0.01.
+        delay: Delay of the commands of the recorded system [s], a multiple of ``fine``.
+        fine: Control step of the recorded system [s], where commands are delayed.
+        to: Values of parameters that deviate and are zero in the file.
+        change: Changes the model, before it is a world and before it deviates.
+        expose: Patterns of the variables of the world.
     """
 
     package: str
@@ -59,6 +63,34 @@ class Case:
     share: float = 1.0
     start: Mapping[str, Any] = None  # type: ignore[assignment]
     delay: float = 0.0
+    fine: float = 0.01
+    to: Mapping[str, float] = field(default_factory=dict)
+    change: Callable[[mujoco.MjSpec], None] | None = None
+    expose: tuple[str, ...] | None = None
+
+
+def lagging(spec: mujoco.MjSpec) -> None:
+    """Put a position servo, whose target is filtered, in place of the motor of a pendulum."""
+    (servo,) = spec.actuators
+    servo.set_to_position(kp=20.0, kv=2.0, timeconst=0.05)  # filterexact
+    servo.ctrlrange, spec.option.timestep = (-2.0, 2.0), 0.002
+
+
+def integrating(spec: mujoco.MjSpec) -> None:
+    """Put servos that integrate a velocity in place of motors."""
+    for servo in spec.actuators:
+        servo.set_to_intvelocity(kp=0.2)
+        servo.gear = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def stiff(spec: mujoco.MjSpec) -> None:
+    """Put stiff servos in place of the motors of an arm, and let it be heavy."""
+    joints = [joint for joint in spec.joints if joint.name[:2] == "r_"]
+    for actuator, joint in zip(spec.actuators, joints, strict=True):
+        actuator.set_to_position(kp=5000.0, kv=100.0)
+        actuator.ctrlrange = joint.range if joint.range[0] < joint.range[1] else (-1.5, 1.5)
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST  # for the stiff servos
+    spec.option.gravity = (0.0, 0.0, -9.81)
 
 
 ANGLES = {"*.position": 2e-3}
@@ -105,7 +137,7 @@ CASES = {
         0.02,
     ),
 }
-OTHERS = {  # nothing was chosen by looking at these
+OTHERS = {  # nothing was chosen by looking at results of these
     "walker: damping": Case(
         "dm_control",
         "suite/walker.xml",
@@ -123,16 +155,83 @@ OTHERS = {  # nothing was chosen by looking at these
         share=0.5,
     ),
 }
+MORE = {  # nor of these: three kinds that were demanded before any fit, and one more model
+    "pendulum: servo with a lag and a delay": Case(
+        "dm_control",
+        "suite/pendulum.xml",
+        {"torque.kp": 1.4, "torque.timeconst": 1.6},
+        ("delay",),
+        ANGLES,
+        steps=80,
+        delay=0.026,
+        fine=0.002,
+        change=lagging,
+    ),
+    "cart-pole: spring, force and friction of zero": Case(
+        "dm_control",
+        "suite/cartpole.xml",
+        {},
+        ("cart.external_force[0]", "hinge_1.frictionloss"),
+        ANGLES,
+        steps=60,
+        to={"slider.stiffness": 2.0},
+        expose=("*", "*.external_force"),
+    ),
+    "reacher: integrated velocity": Case(
+        "dm_control",
+        "suite/reacher.xml",
+        {"shoulder.kp": 1.5, "wrist.kp": 1.5},
+        noise=ANGLES,
+        steps=80,
+        change=integrating,
+    ),
+    "double pendulum on a cart: mass": Case(
+        "gymnasium",
+        "envs/mujoco/assets/inverted_double_pendulum.xml",
+        {"pole2.mass": 1.5},
+        ("hinge.damping",),
+        ANGLES,
+        steps=50,
+        share=0.05,
+    ),
+}
+DEFAULTS = (  # of these, a recording is fitted from random defaults
+    "acrobot: damping",
+    "fish: gain",
+    "reacher: gear and delay",
+    "half cheetah: friction of the floor",
+    "pendulum: servo with a lag and a delay",
+    "cart-pole: spring, force and friction of zero",
+)
 
 
 def world_of(case: Case, **options: Any) -> sw.World:
     """Load the model of a case."""
-    path = Path(importlib.import_module(case.package).__path__[0]) / case.file
+    path: Any = Path(importlib.import_module(case.package).__path__[0]) / case.file
+    if case.change is not None:
+        path = mujoco.MjSpec.from_file(str(path))
+        case.change(path)
+    if case.expose is not None:
+        options["expose"] = case.expose
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
-        if path.suffix == ".urdf":
-            return sw.World(path, **options)
         return sw.World(path, **options)
+
+
+def recorded_by(world: sw.World, case: Case) -> tuple[sw.World, dict[str, float]]:
+    """Return the recorded system of a case, and the true values of all fitted parameters."""
+    truth = deviating(world, case)
+    fine = {"control_dt": case.fine} if case.delay else {}
+    true = world_of(case, **fine).given(truth)
+    also = {n: case.delay if n == "delay" else float(default_of(world, n)) for n in case.also}
+    return true, truth | also
+
+
+def default_of(world: sw.World, name: str) -> float:
+    """Return the value of a parameter, or of a component such as ``force[0]``, in the file."""
+    world.reset(seed=0)
+    variable, _, place = name.partition("[")
+    return float(np.ravel(world[variable])[int(place.rstrip("]") or 0)])
 
 
 def record(
@@ -164,68 +263,123 @@ def record(
 
 def deviating(world: sw.World, case: Case) -> dict[str, float]:
     """Return the true values of the parameters that deviate."""
-    world.reset(seed=0)
-    return {name: factor * float(world[name]) for name, factor in case.factors.items()}
+    factors = case.factors.items()
+    return {n: factor * default_of(world, n) for n, factor in factors} | dict(case.to)
+
+
+def studied(kept: Path, number: int, fit: Callable[[int], sw.Fit]) -> list[dict[str, Any]]:
+    """Return what some fits find; a file of lines of JSON resumes an interrupted study."""
+    done = [*map(json.loads, kept.read_text().splitlines())] if kept.exists() else []
+    for seed in range(len(done), number):
+        begin = time.process_time()
+        found = fit(seed)
+        rows = found.table.set_index("parameter").iterrows()
+        fitted = {name: [row.value, row.low, row.high, bool(row.determined)] for name, row in rows}
+        seconds = time.process_time() - begin
+        done.append({"seconds": seconds, "explains": bool(found.explains), "fitted": fitted})
+        with kept.open("a") as file:
+            file.write(json.dumps(done[-1]) + "\n")
+    return done[:number]
 
 
 def coverage(case: Case, runs: int, kept: Path) -> dict[str, Any]:
-    """Fit recordings with different noise and commands.
+    """Fit recordings with different noise and commands, and count the intervals that cover.
 
-    Every fit is written to a file of lines of JSON, from which an interrupted study goes on.
+    An interval over the whole range ("none") covers. A miss is the distance from the interval to
+    the true value, in widths of the interval.
     """
     world = world_of(case)
-    truth = deviating(world, case)
-    fine = {"control_dt": 0.01} if case.delay else {}
-    true = world_of(case, **fine).given(truth)
-    world.reset(seed=0)
-    expected = truth | {n: case.delay if n == "delay" else float(world[n]) for n in case.also}
-    done = [*map(json.loads, kept.read_text().splitlines())] if kept.exists() else []
-    for seed in range(len(done), runs):
-        begin = time.process_time()
-        fit = world.fit(record(world, true, case, seed), [*expected])
-        rows = fit.table.set_index("parameter").iterrows()
-        fitted = {name: [row.value, row.low, row.high, bool(row.determined)] for name, row in rows}
-        seconds = time.process_time() - begin
-        done.append({"seconds": seconds, "explains": bool(fit.explains), "fitted": fitted})
-        with kept.open("a") as file:
-            file.write(json.dumps(done[-1]) + "\n")
+    true, expected = recorded_by(world, case)
+    done = studied(kept, runs, lambda seed: world.fit(record(world, true, case, seed), [*expected]))
     hits: dict[str, list[bool]] = {name: [] for name in expected}
-    errors, determined = list[float](), list[bool]()
-    for one in done[:runs]:
+    errors, determined, misses, none = list[float](), list[bool](), list[float](), 0
+    for one in done:
         for name, (value, low, high, sure) in one["fitted"].items():
-            hits[name].append(low <= expected[name] <= high)
+            away = max(low - expected[name], expected[name] - high, 0.0)
+            none += bool(np.isnan(low))
+            hits[name].append(not away > 0.0)
             errors.append(abs(value / expected[name] - 1.0) if expected[name] else abs(value))
             determined.append(sure)
+            if sure and away > 0.0:
+                misses.append(away / (high - low))
+    n, cover = sum(map(len, hits.values())), sum(map(sum, hits.values()))
+    seconds = [one["seconds"] for one in done]
     return {
         "parameters": [*expected],
-        "runs": len(done[:runs]),
-        "intervals": sum(map(len, hits.values())),
-        "cover": sum(map(sum, hits.values())),
+        "true values": expected,
+        "runs": len(done),
+        "intervals": n,
+        "cover": cover,
         "covered": {name: f"{sum(each)} of {len(each)}" for name, each in hits.items()},
+        "95 % interval of the coverage": binomial(cover, n),
+        "none": none,
+        "largest miss of a determined interval, in its widths": max(misses, default=0.0),
         "median error": float(np.median(errors)),
         "determined": float(np.mean(determined)),
-        "explains": float(np.mean([one["explains"] for one in done[:runs]])),
-        "CPU seconds for each fit": float(np.mean([one["seconds"] for one in done[:runs]])),
+        "explains": float(np.mean([one["explains"] for one in done])),
+        "CPU seconds for each fit": float(np.mean(seconds)),
+        "longest fit, CPU seconds": float(np.max(seconds)),
+    }
+
+
+def binomial(cover: int, n: int) -> list[float]:
+    """Return the 95 % interval of Clopper and Pearson (Biometrika 1934) of a share."""
+    from scipy.stats import binomtest
+
+    return [*binomtest(cover, n).proportion_ci(0.95)]
+
+
+def from_defaults(case: Case, number: int, kept: Path) -> dict[str, Any]:
+    """Fit one recording by worlds with random defaults of the fitted parameters.
+
+    Defaults are log-uniform within a factor of ten of those in the file, or, where these are zero,
+    of the true value; uniform between 0 and 1 where this is zero, too, and between -1 and 1 if the
+    parameter has a sign. A delay has the default 0. The spread of values is the largest difference
+    of two of them, in widths of the interval of the first fit.
+    """
+    world = world_of(case)
+    true, expected = recorded_by(world, case)
+    recording, names = record(world, true, case, 0), [*expected]
+
+    def fit(seed: int) -> sw.Fit:
+        rng, given = np.random.default_rng(seed), dict[str, Any]()
+        for name in names:
+            factor, share = 10.0 ** rng.uniform(-1.0, 1.0), rng.uniform(-1.0, 1.0)
+            if name == "delay":
+                continue
+            variable, usual = name.partition("[")[0], default_of(world, name) or expected[name]
+            if "[" in name:
+                given[variable] = np.where(np.arange(3) == int(name[-2]), share, 0.0)
+            else:
+                given[variable] = factor * usual if usual else abs(share)
+        return world.given(given).fit(recording, names)
+
+    done = studied(kept, number, fit)
+    spreads = dict[str, dict[str, float]]()
+    for name in names:
+        values, lows, highs, _ = map(np.array, zip(*(o["fitted"][name] for o in done), strict=True))
+        columns = {"value": values, "low": lows, "high": highs}
+        width = highs[0] - lows[0]
+        spreads[name] = {what: float(np.ptp(each) / width) for what, each in columns.items()}
+    return {
+        "fits": len(done),
+        "largest difference, in widths of the interval": spreads,
+        "within a tenth": max(each["value"] for each in spreads.values()) <= 0.1,
+        "determined": [all(one["fitted"][n][3] for n in names) for one in done],
+        "CPU seconds for each fit": float(np.mean([one["seconds"] for one in done])),
     }
 
 
 def payload() -> dict[str, Any]:
     """Fit the mass of a hand under stiff servos, then with a suggested experiment."""
-    case = Case("gymnasium", "envs/mujoco/assets/pusher_v5.xml", {"r_wrist_roll_link.mass": 2.0})
-    case = Case(**{**vars(case), "noise": {"r_*.position": 2e-3}, "steps": 100})
-    spec = mujoco.MjSpec.from_file(
-        str(Path(importlib.import_module(case.package).__path__[0]) / case.file)
+    case = Case(
+        "gymnasium",
+        "envs/mujoco/assets/pusher_v5.xml",
+        {"r_wrist_roll_link.mass": 2.0},
+        noise={"r_*.position": 2e-3},
+        change=stiff,
     )
-    for actuator, joint in zip(
-        spec.actuators, [j for j in spec.joints if j.name[:2] == "r_"], strict=True
-    ):
-        actuator.set_to_position(kp=5000.0, kv=100.0)
-        actuator.ctrlrange = joint.range if joint.range[0] < joint.range[1] else (-1.5, 1.5)
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST  # for the stiff servos
-    spec.option.gravity = (0.0, 0.0, -9.81)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        world = sw.World(spec)
+    world = world_of(case)
     (name,) = case.factors
     truth = deviating(world, case)
     true = world.given(truth)
@@ -234,7 +388,7 @@ def payload() -> dict[str, Any]:
     still = record(world, true, case, 0, held)
     before = world.fit(still, [name])
     (experiment,) = before.suggest(1)
-    moved = Case(**{**vars(case), "start": experiment.start})
+    moved = replace(case, start=experiment.start)
     after = world.fit([still, record(world, true, moved, 1, experiment.commands)], [name])
     found: dict[str, Any] = {"true value": truth[name]}
     for when, fit in (("before", before), ("after", after)):
@@ -316,20 +470,28 @@ def main() -> None:
     """Fit all cases."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=17, help="recordings of each model")
+    parser.add_argument("--defaults", type=int, default=10, help="random defaults of each model")
     parser.add_argument("--only", default="", help="cases whose names contain this")
     parser.add_argument("--out", type=Path, default=HERE / "fit.json")
     parser.add_argument("--kept", type=Path, default=Path("fit-runs"), help="fits of this study")
     asked = parser.parse_args()
-    found: dict[str, Any] = {"runs": asked.runs, "versions": versions("")}
-    begin, cases = time.perf_counter(), {}
+    found: dict[str, Any] = {
+        "runs": asked.runs,
+        "versions": versions(f"mujoco {mujoco.__version__}"),
+    }
+    every, cases, same = {**CASES, **OTHERS, **MORE}, {}, {}
     asked.kept.mkdir(exist_ok=True)
-    for name, case in {**CASES, **OTHERS}.items():
+    for name, case in every.items():
         if asked.only in name:
-            kept = asked.kept / f"{re.sub('[^a-z]+', '-', name)}.jsonl"
-            cases[name] = coverage(case, asked.runs, kept)
+            kept = re.sub("[^a-z]+", "-", name)
+            cases[name] = coverage(case, asked.runs, asked.kept / f"{kept}.jsonl")
             print(name, json.dumps(cases[name], indent=1), flush=True)
-    found["cases"] = cases
-    for title, names in (("the six", CASES), ("others", OTHERS)):
+            if name in DEFAULTS and asked.defaults:
+                kept = f"{kept}-defaults.jsonl"
+                same[name] = from_defaults(case, asked.defaults, asked.kept / kept)
+                print("from random defaults", json.dumps(same[name], indent=1), flush=True)
+    found |= {"cases": cases, "from random defaults": same}
+    for title, names in (("the six", CASES), ("others", OTHERS), ("more", MORE), ("all", every)):
         mine = [case for name, case in cases.items() if name in names]
         intervals, cover = (sum(case[what] for case in mine) for what in ("intervals", "cover"))
         found[title] = {"intervals": intervals, "cover": cover}
@@ -338,7 +500,6 @@ def main() -> None:
         for title, more in (("payload", payload), ("mujoco.sysid", beside_sysid)):
             found[title] = more()
             print(title, json.dumps(found[title], indent=1, default=float), flush=True)
-        found["seconds"] = time.perf_counter() - begin
         asked.out.write_text(json.dumps(found, indent=1, default=float) + "\n")
 
 

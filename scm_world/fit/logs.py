@@ -124,7 +124,7 @@ def _wanted(
         parts.append(f"{topic} ({kind}): {', '.join(own[:SHOWN]) or 'no numbers'}{more}")
     if not found:
         advice = "name some by columns={'/topic.field': 'hinge.position'}"
-        said = "; ".join(parts) or "nothing"
+        said = "; ".join(parts) or "no messages"
         raise ModelError([f"no column is one of this world: {advice}; there are {said}"])
     return found, "; ".join(parts)
 
@@ -252,11 +252,12 @@ def _laid(tables: Mapping[str, pd.DataFrame], step: Step) -> pd.DataFrame:
             twice = np.flatnonzero(np.diff(whole) < 1)
             if len(twice) or np.abs(place - whole).max() > NEAR:
                 worst = twice[0] + 1 if len(twice) else np.abs(place - whole).argmax()
-                many = f"{float(np.median(np.diff(at))):.4g} s apart" if len(at) > 1 else "one"
-                said = f"messages of {topic} ({many}) do not lie on control steps of {dt:g} s"
-                advice = "give the world a shorter control_dt=, or leave columns out by ignore="
-                where = f"first at {at[worst]:.6g} s"
-                raise ModelError([f"{said}, those of {usual}, {where}: {advice}"])
+                period = float(np.median(np.diff(at))) if len(at) > 1 else dt
+                said = f"messages of {topic}, {period:.4g} s apart, do not lie on control steps of "
+                said += f"{dt:g} s, those of {usual}, first at {at[worst]:.6g} s"
+                shorter = f"control_dt={period:.4g}" if period < dt else "a shorter control_dt="
+                advice = f"give the world {shorter}, or leave columns out by ignore="
+                raise ModelError([f"{said}: {advice}"])
             measured.append(seen[topic].set_axis(whole))
         at_once = np.abs(place - whole) * step.substeps <= SAME
         commands = [name for name in table if name in step.commands]

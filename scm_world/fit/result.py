@@ -422,9 +422,17 @@ class Fit:
 
     @property
     def _replayed(self) -> tuple[float, float]:
-        """The errors of the replay of the fit and the unfitted world, in those of a constant."""
-        size = np.maximum(self.replay.constant, self.measured.least[: len(self.replay)])
-        one, other = (((self.replay[kind] / size) ** 2).mean() for kind in ("fit", "unfitted"))
+        """The errors of the replay of the fit and the unfitted world, in those of a constant.
+
+        A column that no run has twice, such as a known start, shows no motion: it does not count.
+        """
+        seen = np.max([np.isfinite(run.values).sum(axis=0) for run in self.runs], axis=0)
+        often = seen[: len(self.replay)] > 1
+        often |= not often.any()
+        size = np.maximum(self.replay.constant, self.measured.least[: len(self.replay)])[often]
+        one, other = (
+            ((self.replay[kind][often] / size) ** 2).mean() for kind in ("fit", "unfitted")
+        )
         return float(one) ** 0.5, float(other) ** 0.5
 
     @property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,13 @@ from typer.testing import CliRunner
 
 import scm_world as sw
 from scm_world.cli.app import app
-from scm_world.errors import ModelError, UnknownOption, UnknownVariable
+from scm_world.errors import (
+    MissingExtra,
+    ModelError,
+    UnknownOption,
+    UnknownVariable,
+    UnreadableFile,
+)
 from scm_world.fit.recordings import Reading, RecordedRun, read_recording
 
 PENDULUM = """
@@ -188,6 +195,9 @@ def test_commands_of_a_bag_act_at_their_own_time(
     fit = world.fit(place, ["hinge.damping"], columns=CONTROL, noise=1e-4)
     assert fit.values["hinge.damping"] == pytest.approx(0.02, rel=1e-6)
     assert fit.squares < 1e-6
+    assert len(fit.runs[0].part(20, 40, 0.02).commands) == 19
+    same = fit.counterfactual({"hinge.damping": fit.values["hinge.damping"]}, at=5, draws=2)
+    np.testing.assert_allclose(same["counterfactual"], same["measured"], atol=1e-6)
     told = world.fit(
         {"time": 0.02 * np.arange(61), "motor.control": sent, "hinge.position": position},
         ["hinge.damping", "delay"],
@@ -271,7 +281,9 @@ def test_messages_say_what_a_bag_has(
     with pytest.raises(ModelError, match=r"no column is one of this world.*/camera \(sensor_msgs"):
         world.fit(place, ["hinge.damping"], ignore=["/joint*"])
     coarse = sw.World(PENDULUM, control_dt=0.05)
-    with pytest.raises(ModelError, match=r"/joint_states .*apart.*control steps of 0\.05 s"):
+    with pytest.raises(
+        ModelError, match=r"/joint_states, 0.02 s apart, .*control steps of 0\.05 s"
+    ):
         coarse.fit(place, ["hinge.damping"], columns=CONTROL)
     (tmp_path / "x").mkdir()
     bag = Bag(tmp_path / "x", "mcap")
@@ -479,3 +491,43 @@ def test_a_column_of_one_of_several_files_is_renamed(
         read_recording(
             world, ["one.csv", "two.csv"], Reading(None, {**names, "qq": "time"}, how[2])
         )
+
+
+def test_what_cannot_be_read_is_refused(
+    world: sw.World, arrays: dict[str, np.ndarray], tmp_path: Path, monkeypatch: Any
+) -> None:
+    """A damaged bag, an empty one, one behind a URL, a dataset without data, and no rosbags."""
+    place = recorded(tmp_path, "file.mcap", arrays)
+    (tmp_path / "cut.mcap").write_bytes(place.read_bytes()[:100])
+    with pytest.raises(UnreadableFile, match=r"cut\.mcap"):
+        world.fit(tmp_path / "cut.mcap", ["hinge.damping"])
+    (tmp_path / "none").mkdir()
+    empty = Bag(tmp_path / "none", "mcap")
+    with pytest.raises(ModelError, match="there are no messages"):
+        world.fit(empty.write(), ["hinge.damping"])
+    dataset(tmp_path / "set", "v3.0", ["other", "hinge"], 1.0)
+    next((tmp_path / "set" / "data").glob("*/*.parquet")).unlink()
+    with pytest.raises(ModelError, match=r"no file data/chunk-000/.*download the data"):
+        sw.World(SERVO).fit(tmp_path / "set", ["hinge.damping"], columns={"*[ne]*": "[rad]"})
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    for name in [name for name in sys.modules if name.startswith("rosbags.")]:
+        monkeypatch.delitem(sys.modules, name)
+    with pytest.raises(MissingExtra, match=r"pip install 'scm-world\[robots\]'"):
+        world.fit(place, ["hinge.damping"])
+
+
+def test_the_command_fits_a_bag(
+    arrays: dict[str, np.ndarray], tmp_path: Path, monkeypatch: Any
+) -> None:
+    """A folder, with the column of the command named; topics are listed where it is not."""
+    monkeypatch.chdir(tmp_path)
+    Path("arm.xml").write_text(PENDULUM)
+    recorded(tmp_path, "sqlite3", arrays)
+    words = ["fit", "arm.xml", "run", "--parameters", "hinge.damping", "--out", "out"]
+    words += ["--noise", "hinge.position=0.001"]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code != 0
+    assert "/motor (std_msgs/msg/Float64MultiArray)" in " ".join(done.output.split())
+    done = CliRunner().invoke(app, [*words, "--column", "/motor.data[0]=motor.control"])
+    assert done.exit_code == 0, done.output
+    assert "a run of 61 rows, 1.2 s, 1 measured column" in done.output

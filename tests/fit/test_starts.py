@@ -102,6 +102,19 @@ def test_wrong_starts_are_refused() -> None:
         world.fit(recording, NAMES, begins={"knee.velocity": (0.0, 0.1)})
 
 
+def test_a_start_that_is_known_is_no_motion_that_a_constant_predicts_better() -> None:
+    """A fit that replays each motion within its noise is compared by the motions alone."""
+    begins = np.append(0.0, np.full(40, np.nan))
+    recording = moved(2.6) | {"hinge.velocity": begins}
+    noise = {"hinge.position": NOISE, "hinge.velocity": 1e-3}
+    with sw.World(SERVO) as world:
+        fit = world.fit(recording, NAMES, noise=noise)
+    shown = fit.replay.set_index("column")
+    assert shown.constant["hinge.velocity"] == 0.0
+    assert shown.fit["hinge.position"] < 1.5 * NOISE < 0.1 * shown.constant["hinge.position"]
+    assert not any("a constant is nearer" in remark for remark in fit.remarks)
+
+
 def test_a_fit_that_replays_worse_than_the_file_determines_nothing() -> None:
     """Short windows hide friction that is not modelled; plain MuJoCo has the same replays."""
     world, recording = sw.World(SERVO), moved(2.0, 100, friction=0.1, at=0.0, most=0.3)
