@@ -542,7 +542,7 @@ def fit(
         begins: How the recordings begin: 'rest', or a state with its standard deviation, such as
             '*.velocity=0,0.01'; fitted by default.
         column: Name of this system for a column of the files, such as torque=motor.control, if need
-            be with its unit, 'stamp=time [ms]'.
+            be with its unit after it in brackets.
         ignore: Columns that are left out, such as 'temperature*'.
         setup: Value of a parameter that was set for a recording, such as 1:weight.mass=1.0; the
             first recording has the number 0.

@@ -34,10 +34,11 @@ def test_help_has_an_example_of_existing_options(name: str) -> None:
     assert shown.exit_code == 0, shown.output
     command = COMMANDS[name] if name else GROUP
     (example,) = re.findall(r"Example: scm-world ([^\n]+)", " ".join(command.help.split()))
-    called = max((one for one in COMMANDS if example.startswith(f"{one} ")), key=len)
+    example = example.rstrip(".")
+    called = max((one for one in COMMANDS if f"{example} ".startswith(f"{one} ")), key=len)
     known = {flag for option in COMMANDS[called].params for flag in option.opts}
     assert called.startswith(name)
-    words = shlex.split(example.removeprefix(called).rstrip("."))
+    words = shlex.split(example.removeprefix(called))
     assert {word for word in words if word.startswith("-")} <= known
 
 

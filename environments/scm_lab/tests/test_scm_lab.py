@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import socket
 import subprocess
 import sys
@@ -12,6 +13,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import pytest
@@ -92,6 +94,23 @@ def test_a_scripted_agent_has_the_score_that_it_has_without_a_server(url: str) -
             True,
             "invalid_args",
         )
+
+
+def test_the_class_for_trl_is_played_by_a_script(url: str) -> None:
+    """That of the README: it sets the cause to both values, and submits the difference."""
+    (block,) = re.findall(r"^```python\n(.*?)^```$", (HERE / "README.md").read_text(), re.M | re.S)
+    names: dict[str, Any] = {}
+    exec(block, names)  # noqa: S102 # our own text
+    names["URL"] = url
+    episode = names["Episode"]()
+    query = json.loads(episode.reset(seed=0))["query"]
+    means = []
+    for end in ("from", "to"):
+        table = json.loads(episode.experiment({query["cause"]: query[end]}, 200))["columns"]
+        means.append(fmean(table[query["outcome"]]))
+    score = json.loads(episode.submit(means[1] - means[0], 0.9))["score"]
+    assert names["reward"]([episode]) == [score]
+    assert score == lab.question("effect", seed=0).grade(means[1] - means[0])
 
 
 def test_tools_are_listed(url: str) -> None:
