@@ -1,11 +1,10 @@
-"""Measure laboratories: certified questions, their answers, agents by budget; write manifests.
+"""Measure laboratories: certified questions and their answers; write manifests.
 
 ::
 
     python -m benchmarks.lab questions --n 25  # of each kind: certificates and CPU time
     python -m benchmarks.lab truth             # their answers, by an independent script
-    python -m benchmarks.lab agents --n 4      # curves of score by budget
-    python -m benchmarks.lab suites            # the manifests of physics-1 and lab-1
+    python -m benchmarks.lab suites --made DIR # the manifests, with the hashes of made folders
 
 The figures are in ``lab.json``. Questions are those of ``lab-1``, in the order of its parts.
 """
@@ -22,7 +21,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks import as_json
+from benchmarks.lab_truth import confirm
 from scm_world import lab
+from scm_world.discovery.data import load
 from scm_world.discovery.learners.registry import learn
 from scm_world.lab import suites
 from scm_world.lab.questions import Question
@@ -46,7 +47,7 @@ SOURCES = {
     "boxes": "scm_world.lab.suites:boxes",
     "pushing": "pushing",
 }
-TRIVIAL = ("empty", "bipartite", "correlation", "sort_regress")
+TRIVIAL = ("bipartite", "correlation")
 
 
 def recipes() -> dict[str, dict[str, Any]]:
@@ -120,7 +121,7 @@ def jobs(n: int) -> list[dict[str, Any]]:
     for i in range(n):
         for name, recipe in recipes().items():
             if name.endswith(levels[i % len(levels)]):
-                found.append(suites._specs(recipe)[i // len(levels)])
+                found.append(suites._specs(recipe)[i])
     return found
 
 
@@ -157,10 +158,9 @@ def table(rows: list[dict[str, Any]]) -> dict[str, Any]:
 # --- manifests ------------------------------------------------------------------------------------
 
 
-def trivial_tables(recipe: dict[str, Any]) -> dict[str, float]:
+def trivial_tables(folder: Path, about: dict[str, Any]) -> dict[str, float]:
     """Return the scores of trivial learners on a table."""
-    rows, about = suites._table(recipe)
-    found = {}
+    rows, found = load(folder), dict[str, float]()
     for name in TRIVIAL:
         graph = learn(name, rows.lagged() if rows.is_temporal else rows)
         pairs = {tuple(n.split("@")[0].split("[")[0] for n in edge[:2]) for edge in graph.directed}
@@ -224,7 +224,7 @@ def manifests(made: dict[str, Path]) -> None:
             if path is None or not path.exists() or recipe.get("private"):
                 continue
             about = json.loads(path.read_text())["content"]
-            trivial = about.get("trivial") or trivial_tables(recipe)
+            trivial = about.get("trivial") or trivial_tables(made[name] / part, about)
             draws = {"draws": about["draws"]} if "draws" in about else {}
             recipe.update(sha256=about["sha256"], trivial=trivial, **draws)
         text = as_json({**ABOUT[name], **found, "parts": parts}, 2)
@@ -234,7 +234,7 @@ def manifests(made: dict[str, Path]) -> None:
 def main() -> None:
     """Run one part."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("part", choices=("questions", "truth", "agents", "suites"))
+    parser.add_argument("part", choices=("questions", "truth", "suites"))
     parser.add_argument("--n", type=int, default=25)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--rows", type=Path, default=HERE / "lab_questions.jsonl")
@@ -242,6 +242,15 @@ def main() -> None:
     given = parser.parse_args()
     if given.part == "questions":
         questions(given.n, given.workers, given.rows)
+    if given.part == "truth":
+        rows = [json.loads(line) for line in given.rows.read_text().splitlines()]
+        found = table(rows)
+        for row in rows:
+            if "spec" in row:
+                outcome = confirm(Question.of(row["spec"]))["confirmed"]
+                count = found[row["spec"]["kind"]].setdefault("confirmed", {})
+                count[str(outcome)] = count.get(str(outcome), 0) + 1
+        RESULTS.write_text(as_json({"questions": found}) + "\n")
     if given.part == "suites":
         manifests({path.name: path for path in given.made})
 

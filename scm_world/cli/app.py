@@ -9,8 +9,8 @@ import typer
 from typer.core import TyperGroup
 
 from scm_world.cli import console, suites
+from scm_world.cli import lab as labs
 from scm_world.cli.data import collect, discover, sweep, triplets, verify
-from scm_world.cli.lab import serve
 from scm_world.cli.options import command
 from scm_world.cli.policies import clone, evaluate, explain, train
 from scm_world.cli.systems import (
@@ -54,8 +54,7 @@ app = typer.Typer(
 laboratories = typer.Typer(
     name="lab",
     no_args_is_help=True,
-    help="Laboratories for agents: certified causal questions.\n\n"
-    "Example: scm-world lab serve effect --mcp",
+    help="Laboratories for agents: certified causal questions.\n\nExample: scm-world lab run",
 )
 app.add_typer(laboratories)
 SUITE = "Benchmark suites: list them, make them anew, score answers. Example: scm-world suite list"
@@ -90,7 +89,7 @@ COMMANDS: tuple[Callable[..., None], ...] = (
 )
 GROUPS: Mapping[typer.Typer, tuple[Callable[..., None], ...]] = {
     app: COMMANDS,
-    laboratories: (serve,),
+    laboratories: (labs.list_, labs.question, labs.run, labs.play, labs.replay, labs.serve),
     suite: (suites.list_, suites.make, suites.score),
 }
 for _group, _functions in GROUPS.items():

@@ -3,14 +3,137 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import secrets
 from contextlib import suppress
-from typing import Annotated
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from scm_world._arguments import load, one_of
 from scm_world.cli import console, options
+
+if TYPE_CHECKING:
+    from scm_world.lab import Laboratory, Question
+
+Key = Annotated[str | None, typer.Option(envvar="SCM_LAB_KEY")]
+
+
+@dataclass
+class Asked:
+    """The options of a question.
+
+    Args:
+        kind: Kind of the question; see scm-world lab list.
+        world: World of the question, or a model file.
+        level: Prior knowledge, L1 to L4.
+        key: Secret of private questions.
+        noise: Noise of readings, as a share of their spread.
+        law: Law of springs and drag: plain, cubic, square or 'dead zone'.
+    """
+
+    kind: str = "effect"
+    world: str = "equations"
+    seed: options.NotNegative = 0
+    level: str = "L2"
+    key: Key = None
+    noise: options.Amount = 0.02
+    law: str = "plain"
+
+    def question(self) -> Question:
+        """Return the question."""
+        from scm_world.lab import question
+
+        more = {"noise": self.noise, "law": self.law}
+        return question(self.kind, self.world, self.seed, self.level, self.key, **more)
+
+
+def list_() -> None:
+    """List kinds of questions and their worlds.
+
+    Example: scm-world lab list
+    """
+    from scm_world.lab import KINDS, offers
+
+    rows = [
+        {"kind": name, "worlds": ", ".join(offers(name)), "about": one.doc}
+        for name, one in KINDS.items()
+    ]
+    console.frame(rows, title="questions; a model file is a world, too")
+
+
+def question(asked: Asked) -> None:
+    """Show a certified question, without its answer.
+
+    Example: scm-world lab question --kind effect --world springs --seed 3 --level L2
+    """
+    made = asked.question()
+    shown = {**made.describe(), "certificate": made.certificate}
+    typer.echo(json.dumps(shown, indent=1, ensure_ascii=False))
+
+
+def run(asked: Asked, *, agent: str = "random", out: options.Text = None) -> None:
+    """Let a scripted agent answer a question, and print its score.
+
+    Example: scm-world lab run --kind effect --world springs --seed 3 --agent random
+
+    Args:
+        agent: random or ideal.
+        out: File of the run, for scm-world lab replay.
+    """
+    from scm_world import lab
+
+    _finish(lab.play(agent, asked.question()), out)
+
+
+def play(asked: Asked, *, out: options.Text = None) -> None:
+    """Answer a question by hand: type a tool and its arguments as JSON.
+
+    Example: scm-world lab play --kind effect --world springs
+
+    Args:
+        out: File of the run, for scm-world lab replay.
+    """
+    from scm_world import lab
+
+    room = lab.Laboratory(asked.question())
+    typer.echo(json.dumps(room.call("describe"), indent=1, ensure_ascii=False))
+    typer.echo('Type for example: experiment {"do": {"x0": 1}, "n": 5}')
+    while not room.finished:
+        try:
+            tool, _, text = input("> ").strip().partition(" ")
+            said = room.call(tool, json.loads(text or "{}"))
+        except EOFError:
+            break
+        except (ValueError, RecursionError) as error:
+            said = {"refused": f"the arguments are not JSON: {error}"}
+        typer.echo(json.dumps(said))
+    _finish(room, out)
+
+
+def _finish(room: Laboratory, out: str | None) -> None:
+    typer.echo(json.dumps(room.score))
+    if out is not None:
+        console.say(f"written: {room.save(Path(out))}", stderr=True)
+
+
+def replay(file: Annotated[str, typer.Argument(metavar="FILE")], *, key: Key = None) -> None:
+    """Repeat a saved run, and say what differs; the exit code is then 1.
+
+    Example: scm-world lab replay run.json
+
+    Args:
+        file: The file that scm-world lab run wrote.
+        key: Secret of a private question.
+    """
+    from scm_world import lab
+
+    found = lab.replay(file, key)
+    typer.echo("\n".join(f"differs: {one}" for one in found) or "identical, to the last bit")
+    if found:
+        raise typer.Exit(1)
 
 
 def serve(

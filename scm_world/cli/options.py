@@ -86,13 +86,15 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     """Return a command for typer: its options are those of the function and of their groups.
 
     A group is a dataclass, of which the function has an argument. The help of options comes from
-    the ``Args`` of the function's docstring, or from ``HELP``.
+    the ``Args`` of its docstring, of the function's, or from ``HELP``.
     """
-    text, _, described = (inspect.getdoc(function) or "").partition("\n\nArgs:\n")
-    found = re.findall(r"^ {4}(\w+): (.*(?:\n {6,}.*)*)", described, flags=re.MULTILINE)
-    helps = HELP | {name: " ".join(said.split()) for name, said in found}
     own = _arguments(function)
     kinds = {name: kind for name, kind, _ in own if isinstance(kind, type) and is_dataclass(kind)}
+    text, helps = "", HELP
+    for one in (*kinds.values(), function):
+        text, _, described = (inspect.getdoc(one) or "").partition("\n\nArgs:\n")
+        found = re.findall(r"^ {4}(\w+): (.*(?:\n {6,}.*)*)", described, flags=re.MULTILINE)
+        helps = helps | {name: " ".join(said.split()) for name, said in found}
     groups = {name: _arguments(kind) for name, kind in kinds.items()}
     made = []
     for name, hint, default in (one for each in own for one in groups.get(each[0], [each])):

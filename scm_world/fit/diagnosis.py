@@ -44,6 +44,7 @@ ROUGH = 1e-3  # precision of the squared residuals, relative
 STARTS = 3  # from which a term is searched
 SHORTLY, FEW, MANY = 3, 5, 15  # steps of a search: of each start, of a term, of a likely one
 LIKELY = 0.3  # of the largest gain, at which a search goes on
+LEAST = 3.0  # by which the logarithm of a number may be below its default, to begin with
 NEAR = 0.1, -0.1  # scaled numbers to begin with
 SENSORS = {"gain": NEAR, "offset": NEAR, "lag": (0.5, 2.0, -0.5)}
 PLAIN = {"frictionloss": "Coulomb friction", "damping": "viscous damping"}
@@ -267,7 +268,7 @@ class _Diagnosing:
     def _fitted(self, term: Term, begin: Fit, most: int) -> Fit:
         """Fit the numbers of the fit and those of a term, beginning from another fit."""
         world, fit = term.world, self._fit
-        measured, times = _recorded(self._measured, term)
+        measured, times = recorded_for(self._measured, term)
         with twin_of(world) as twin:
             ranges = any(name.endswith("range") for name in term.names)
             added = targets_of(twin, term.names, symmetric=ranges) if term.names else ()
@@ -293,6 +294,8 @@ class _Diagnosing:
             before = np.array([known.get(target.name, 0.0) for target in own])
             tried = [before]
             if not {target.name for target in own} <= {*known}:
+                least = [-LEAST if target.log else -np.inf for target in own]
+                before = np.maximum(before, least)  # at nearly 0, a logarithm changes nothing
                 moves = [[by.get(target.name, 0.0) for target in own] for by in term.begins]
                 tried = [problem.within(before + np.array(move)) for move in moves]
             shortly = replace(squares, most=SHORTLY if len(tried) > 1 else most)
@@ -306,7 +309,7 @@ class _Diagnosing:
                 at = gauss_newton(replace(squares, most=most), at.scaled, at.starts)
             none: dict[str, Any] = {"reach": None, "played": None, "later": None, "reading": ""}
             return replace(
-                *(fit,),
+                fit,
                 asked=world,
                 measured=measured,
                 targets=own,
@@ -503,7 +506,7 @@ def _stribeck(_: Floats, v: Floats, friction: Floats, drop: Floats, speed: Float
     return np.asarray(drop * friction * fast * np.sign(v))
 
 
-def _recorded(measured: Measurements, term: Term) -> tuple[Measurements, int]:
+def recorded_for(measured: Measurements, term: Term) -> tuple[Measurements, int]:
     """Return a recording for the world of a term, and how many of its control steps are one.
 
     Commands of motors that were added are 0.
@@ -517,6 +520,8 @@ def _recorded(measured: Measurements, term: Term) -> tuple[Measurements, int]:
             for one in (run.commands, run.before)
         )
         about: dict[str, Any] = {"commands": sent, "before": before}
+        if run.sent is not None:
+            about["sent"] = times * run.sent[0], np.pad(run.sent[1], wide)
         runs.append(replace(run, **about, instants=times * run.instants))
     columns = tuple(
         c._replace(variable=term.renamed.get(c.variable, c.variable)) for c in measured.columns

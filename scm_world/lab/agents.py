@@ -10,6 +10,7 @@ import numpy as np
 
 from scm_world._arguments import one_of
 from scm_world._types import Floats
+from scm_world.lab.expressions import evaluate
 from scm_world.lab.laboratory import Laboratory
 from scm_world.lab.questions import Question
 
@@ -48,28 +49,22 @@ class _Known:
 # --- regression -----------------------------------------------------------------------------------
 
 
-def _powers(x: Floats, degree: int) -> Floats:
-    return np.vander(x, degree + 1, increasing=True)
-
-
-def _polynomial(x: Floats, y: Floats, degrees: range = range(1, 6)) -> Floats:
-    """Return the polynomial of the degree that predicts best what it is not fitted to."""
-    best, found = np.inf, np.zeros(1)
+def _curve(name: str, x: Floats, y: Floats) -> str:
+    """Return the polynomial or broken line that predicts best what it is not fitted to."""
     middle, half = 0.5 * (x.max() + x.min()), 0.5 * np.ptp(x)
-    for degree in degrees:
-        if len(x) < 2 * degree + 2:
-            break
-        basis = _powers((x - middle) / half, degree)
-        hat = basis @ np.linalg.pinv(basis)
-        left = (y - hat @ y) / np.maximum(1.0 - np.diag(hat), 1e-9)  # leave one out
-        if (error := float(np.mean(left**2))) < 0.98 * best:
-            best, found = error, np.linalg.pinv(basis) @ y
-    return np.array([middle, half, *found])
-
-
-def _at(fitted: Floats, x: Any) -> Any:
-    middle, half, *weights = fitted
-    return sum(w * ((x - middle) / half) ** k for k, w in enumerate(weights))
+    u = f"(({name} - {middle:.6g}) / {half:.6g})"
+    powers = [[f"{u} ** {k}" for k in range(degree + 1)] for degree in range(1, 6)]
+    knots = [np.linspace(x[0], x[-1], k + 2)[1:-1] for k in (1, 3, 7)]
+    lines = [["1", name, *(f"abs({name} - {knot:.5g})" for knot in some)] for some in knots]
+    best, found = np.inf, ""
+    for terms in [*powers, *lines]:
+        basis = np.stack([evaluate(term, {name: x}) for term in terms], axis=1)
+        inverse = np.linalg.pinv(basis)
+        left = (y - basis @ (inverse @ y)) / np.maximum(1.0 - np.diag(basis @ inverse), 1e-9)
+        if (error := float(np.mean(left**2))) < 0.95 * best:
+            weights = zip(inverse @ y, terms, strict=True)
+            best, found = error, " + ".join(f"{w:.6g} * {term}" for w, term in weights)
+    return found
 
 
 def _terms(columns: Columns, causes: list[str], richness: int) -> Floats:
@@ -163,21 +158,15 @@ def _solve_effect(known: _Known) -> float:
     return float(ends[0] - ends[1])
 
 
-def _response(known: _Known) -> tuple[Floats, tuple[float, float]]:
-    """Return the mean of an outcome as a polynomial of its cause."""
+def _solve_law(known: _Known) -> Any:
+    """Return the mean of an outcome as an expression of its cause."""
     cause, outcome = known.query["cause"], known.query["outcome"]
     low, high = known.ends[cause]
-    places = np.linspace(low, high, 16)
-    n = known.budget // 16
+    places = np.linspace(low, high, 32 if known.query["held"] else 16)
+    n = known.budget // len(places)
     dos = [{**known.query["held"], cause: float(place)} for place in places]
     y = np.array([_experiment(known.room, do, n)[outcome].mean() for do in dos])
-    return _polynomial(places, y), (low, high)
-
-
-def _solve_law(known: _Known) -> Any:
-    (middle, half, *weights), _ = _response(known)
-    x = f"(({known.query['cause']} - {middle:.9g}) / {half:.9g})"
-    return " + ".join(f"{w:.6g} * {x} ** {k}" for k, w in enumerate(weights))
+    return _curve(cause, places, y)
 
 
 def _solve_prediction(known: _Known) -> Any:
@@ -210,10 +199,10 @@ def _solve_counterfactual(known: _Known) -> float:
 
 
 def _solve_control(known: _Known) -> Any:
-    fitted, ends = _response(known)
-    grid = np.linspace(*ends, 2001)
-    best = grid[np.argmin(np.abs(_at(fitted, grid) - known.query["target"]))]
-    return {known.query["cause"]: float(best)}
+    cause, (low, high) = known.query["cause"], known.ends[known.query["cause"]]
+    grid = np.linspace(low, high, 2001)
+    apart = np.abs(evaluate(_solve_law(known), {cause: grid}) - known.query["target"])
+    return {cause: float(grid[np.argmin(apart)])}
 
 
 def _solve_explanation(known: _Known) -> Any:

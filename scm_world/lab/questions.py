@@ -17,7 +17,7 @@ from scm_world._types import Floats
 from scm_world.discovery.metrics import evaluate as evaluate_graph
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.lab.expressions import FORM, evaluate
-from scm_world.lab.worlds import WORLDS, Apparatus, Knobs
+from scm_world.lab.worlds import RIGS, WORLDS, Apparatus, Knobs, apparatus
 from scm_world.queries import Laboratory
 from scm_world.variables import Box, Draw, Hard
 
@@ -388,8 +388,9 @@ def _grade_prediction(answer: Any, question: Question) -> float:
 def _counterfactual(bench: Bench, rng: np.random.Generator) -> Made:
     cause, outcome = _pair(bench, rng)
     run, other = bench.unit({})
-    low, high = bench.ends(cause)
-    value = _inside(bench, cause, 0.9 if run[cause] < 0.5 * (low + high) else 0.1)
+    one = bench.quantities[cause]
+    is_low = bench.inner(cause, run[cause]) < 0.5 * (one.low + one.high)
+    value = _inside(bench, cause, 0.9 if is_low else 0.1)
     answer = other({cause: value})[outcome]
     size = abs(answer - run[outcome])
     if size < 0.3 * bench.spread[outcome]:
@@ -515,17 +516,18 @@ KINDS: Mapping[str, Kind] = {
         "The variable that deviates in a recording.", "a name", _diagnosis, _grade_name
     ),
 }
-RIGS_ONLY = ("explanation", "diagnosis")
+FILES = (".xml", ".urdf", ".mjcf")
 
 
 def offers(kind: str) -> tuple[str, ...]:
-    """Return the worlds that have questions of a kind."""
+    """Return the worlds that have questions of a kind; model files have all but ``"graph"``."""
     one_of("kind", kind, tuple(KINDS))
     if kind == "graph":
-        return ("equations", "servo", "network")
-    if kind in RIGS_ONLY:
-        return tuple(world for world in WORLDS if world not in ("equations", "servo", "network"))
-    return tuple(world for world in WORLDS if world != "network")
+        return "equations", "servo", "network"
+    if kind in ("explanation", "diagnosis"):
+        return tuple(RIGS)
+    without = ("network", "boxes") if kind == "law" else ("network",)  # a touch is no expression
+    return tuple(world for world in WORLDS if world not in without)
 
 
 # --- questions ------------------------------------------------------------------------------------
@@ -653,7 +655,9 @@ def made(
     Its random numbers follow from an HMAC-SHA256 of kind, world, knobs, seed and draw under the
     key, so that nobody without the key can make it.
     """
-    one_of("world", world, offers(kind))
+    is_file = kind != "graph" and isinstance(world, str) and world.endswith(FILES)
+    if not is_file:
+        one_of("world", world, offers(kind))
     one_of("level", level, tuple(LEVELS))
     seed, draw = whole_number("seed", seed, least=0), whole_number("draw", draw, least=0)
     check_key(key)
@@ -661,7 +665,7 @@ def made(
     hashed = hmac.new((key or "").encode(), told.encode(), hashlib.sha256).digest()
     entropy = int.from_bytes(hashed[:7], "big")
     rng = np.random.default_rng([entropy, 0])
-    bench = Bench(WORLDS[world][0](rng, knobs), level, knobs, entropy)
+    bench = Bench(apparatus(world, rng, knobs), level, knobs, entropy)
     found = KINDS[kind].make(bench, rng)
     return Question(
         kind,

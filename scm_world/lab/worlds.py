@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from types import MappingProxyType
 from typing import Any, NamedTuple, final
 
 import numpy as np
 
 from scm_world._arguments import one_of, real_number, whole_number
 from scm_world._types import Floats
+from scm_world.errors import ModelError
 from scm_world.queries import SCM, Outcome, World
 from scm_world.queries.questions import Questions
 from scm_world.tasks import ModelTask
@@ -79,7 +81,7 @@ class Apparatus:
     setting: Mapping[str, Any]
     budget: int
     doc: str
-    truth: int = 60
+    truth: int = 48
     independent: bool = True
     edges: tuple[Edge, ...] = ()
     confounded: tuple[Edge, ...] = ()
@@ -272,55 +274,205 @@ class Rig(NamedTuple):
     """A model with causes that vary by themselves.
 
     Attributes:
-        xml: Returns the model, of a law and three drawn numbers around 1.
+        xml: Returns the model, of a law and three numbers that are drawn around 1.
         causes: Unit, lowest and highest value by variable.
-        reads: Outcomes, with their units.
-        seconds: Length of an episode [s], in four control steps.
+        reads: Units of the variables that are read.
+        seconds: Length of an episode [s].
         doc: A sentence.
+        steps: Control steps of an episode.
+        agent: Weights of the states that a command follows, by command.
     """
 
-    xml: Callable[[str, Floats], str]
+    xml: Callable[[str, Floats], Any]
     causes: Mapping[str, tuple[str, float, float]]
     reads: Mapping[str, str]
     seconds: float
     doc: str
+    steps: int = 4
+    agent: Mapping[str, Mapping[str, float]] = MappingProxyType({})
+
+
+def _model(timestep: float, bodies: str, rest: str = "", gravity: str = "0 0 0") -> str:
+    options = f'<option timestep="{timestep}" gravity="{gravity}"/>'
+    return f"<mujoco>{options}<worldbody>{bodies}</worldbody>{rest}</mujoco>"
+
+
+def _laws(law: str, k: Floats, stiffness: float, damping: float) -> str:
+    """Return the attributes of a joint with a spring, drag and dry friction under a law."""
+    spring, drag = stiffness * k[0], damping * k[1]
+    springs = f"{0.1 * spring:.4f} 0 {5 * spring:.4f}" if law == "cubic" else f"{spring:.4f}"
+    drags = f"{0.1 * drag:.4f} {2 * drag:.4f}" if law == "square" else f"{drag:.4f}"
+    dry = 0.1 * stiffness * k[2] if law == "dead zone" else 0.0
+    return f'stiffness="{springs}" damping="{drags}" frictionloss="{dry:.4f}"'
+
+
+def _body(name: str, at: str, joint: str, geom: str) -> str:
+    return (
+        f'<body name="{name}" pos="{at}"><joint name="{name}" {joint}/><geom name="{name}" {geom}/>'
+        "</body>"
+    )
+
+
+BALL = 'type="sphere" size="0.05" mass="0.5" contype="0" conaffinity="0"'
+SLIDE = 'type="slide" axis="1 0 0"'
 
 
 def _springs(law: str, k: Floats) -> str:
-    stiffness = {"cubic": f"0.5 0 {30 * k[0]:.4f}"}.get(law, f"{6 * k[0]:.4f}")
-    damping = {"square": f"0.05 {2 * k[1]:.4f}"}.get(law, f"{0.8 * k[1]:.4f}")
-    dry = 0.4 * k[2] if law == "dead zone" else 0.0
-    joint = f'type="slide" axis="1 0 0" stiffness="{stiffness}" damping="{damping}"'
-    return f"""<mujoco model="springs"><option timestep="0.01" gravity="0 0 0"/><worldbody>
-<body name="left"><joint name="left" {joint} frictionloss="{dry:.4f}"/>
-<geom type="sphere" size="0.05" mass="0.5" contype="0" conaffinity="0"/></body>
-<body name="right" pos="1 0 0"><joint name="right" {joint} frictionloss="{dry:.4f}"/>
-<geom type="sphere" size="0.05" mass="0.5" contype="0" conaffinity="0"/></body></worldbody>
-<tendon><fixed name="spring" stiffness="{4 * k[2]:.4f}"><joint joint="left" coef="1"/>
-<joint joint="right" coef="-1"/></fixed></tendon></mujoco>"""
+    joint = f"{SLIDE} {_laws(law, k, 6.0, 0.8)}"
+    tendon = f"""<tendon><fixed name="spring" stiffness="{4 * k[2]:.4f}">
+<joint joint="left" coef="1"/><joint joint="right" coef="-1"/></fixed></tendon>"""
+    return _model(
+        0.01, _body("left", "0 0 0", joint, BALL) + _body("right", "1 0 0", joint, BALL), tendon
+    )
 
 
+def _lever(law: str, k: Floats) -> str:
+    weights = "".join(
+        f'<body name="{name}" pos="{at:.4f} 0 0"><geom size="0.04" mass="0.5" contype="0" '
+        'conaffinity="0"/></body>'
+        for name, at in (("left", -0.4 * k[0]), ("right", 0.4 * k[1]))
+    )
+    beam = 'type="box" size="0.5 0.02 0.02" mass="0.3" contype="0" conaffinity="0"'
+    joint = f'type="hinge" axis="0 1 0" {_laws(law, k, 4.0, 0.4)}'
+    body = _body("beam", "0 0 0", joint, beam).replace("</body>", f"{weights}</body>")
+    return _model(0.01, body, gravity="0 0 -9.81")
+
+
+def _boxes(law: str, k: Floats) -> str:
+    box = 'type="box" size="0.05 0.05 0.05" mass="0.5" solref="0.01 0.8" friction="0"'
+    joint = f"{SLIDE} {_laws(law, k, 0.0, 0.3)}".replace('frictionloss="0.0000"', "")
+    dry = f'frictionloss="{0.3 * k[2]:.4f}"' if 'frictionloss="' not in joint else ""
+    return _model(
+        0.005,
+        _body("first", "0 0 0", f"{joint} {dry}", box)
+        + _body("second", f"{0.25 * k[0]:.4f} 0 0", f"{joint} {dry}", box),
+    )
+
+
+def _funnel(law: str, k: Floats) -> str:
+    walls = "".join(
+        f'<geom type="box" size="0.02 0.2 0.4" pos="{side * 0.35} 0 0" euler="0 {side * 35} 0"/>'
+        for side in (-1, 1)
+    )
+    ball = f"""<body name="ball" pos="0 0 0.6">
+<joint name="across" {SLIDE} {_laws(law, k, 0.0, 0.1)}/>
+<joint name="down" type="slide" axis="0 0 -1" damping="0.1"/>
+<geom name="ball" size="0.04" mass="0.2" friction="0.2 0 0" solref="0.02 0.7"/></body>"""
+    return _model(0.005, walls + ball, gravity="0 0 -9.81")
+
+
+def _cartpole(law: str, k: Floats) -> str:
+    pole = f"""<body name="pole"><joint name="pole" axis="0 1 0" damping="{0.02 * k[1]:.4f}"/>
+<geom type="capsule" fromto="0 0 0 0 0 {0.6 * k[0]:.4f}" size="0.02" mass="0.2" contype="0"
+conaffinity="0"/></body>"""
+    cart = 'type="box" size="0.1 0.05 0.05" mass="1" contype="0" conaffinity="0"'
+    body = _body("cart", "0 0 0", f"{SLIDE} {_laws(law, k, 0.0, 0.5)}", cart)
+    motor = '<actuator><motor name="push" joint="cart" ctrlrange="-20 20"/></actuator>'
+    return _model(0.01, body.replace("</body>", f"{pole}</body>"), motor, "0 0 -9.81")
+
+
+MASS, SPEED = ("kg", 0.2, 1.5), ("m/s", 0.3, 2.0)
 RIGS: Mapping[str, Rig] = {
     "springs": Rig(
         _springs,
         {
-            "left.mass": ("kg", 0.2, 1.5),
-            "right.mass": ("kg", 0.2, 1.5),
+            **{f"{side}.mass": MASS for side in ("left", "right")},
             "spring.stiffness": ("N/m", 1.0, 9.0),
-            "left.velocity": ("m/s", 0.3, 2.0),
-            "right.velocity": ("m/s", 0.3, 2.0),
+            **{f"{side}.velocity": SPEED for side in ("left", "right")},
         },
         {"left.position": "m", "right.position": "m"},
         1.2,
         "Two masses on springs, coupled by a spring, begin with a speed.",
     ),
+    "lever": Rig(
+        _lever,
+        {
+            **{f"{side}.mass": MASS for side in ("left", "right")},
+            "beam.stiffness": ("N m/rad", 4.0, 12.0),
+            "beam.damping": ("N m s/rad", 0.2, 2.0),
+            "beam.velocity": ("rad/s", -2.0, 2.0),
+        },
+        {"beam.position": "rad", "beam.velocity": "rad/s"},
+        1.0,
+        "A beam on a pivot with a spring, and a weight on either side.",
+    ),
+    "boxes": Rig(
+        _boxes,
+        {
+            **{f"{box}.mass": MASS for box in ("first", "second")},
+            "first.velocity": ("m/s", 0.3, 2.5),
+            **{f"{box}.damping": ("N s/m", 0.1, 1.5) for box in ("first", "second")},
+        },
+        {"first.position": "m", "second.position": "m"},
+        1.2,
+        "A box slides towards another one, which it may touch.",
+    ),
+    "funnel": Rig(
+        _funnel,
+        {
+            "ball.mass": ("kg", 0.05, 0.5),
+            "across.position": ("m", -0.12, 0.12),
+            "across.velocity": ("m/s", -0.6, 0.6),
+            "down.velocity": ("m/s", -1.0, 1.0),
+            "across.damping": ("N s/m", 0.0, 1.0),
+        },
+        {"across.position": "m", "down.position": "m"},
+        0.6,
+        "A ball falls into a funnel.",
+    ),
+    "cartpole": Rig(
+        _cartpole,
+        {
+            "cart.mass": ("kg", 0.4, 3.0),
+            "pole.mass": ("kg", 0.1, 1.0),
+            "cart.damping": ("N s/m", 0.1, 4.0),
+            "pole.position": ("rad", -0.25, 0.25),
+            "cart.velocity": ("m/s", -0.6, 0.6),
+        },
+        {"cart.position": "m", "pole.position": "rad"},
+        1.2,
+        "An agent with a linear feedback pushes a cart to balance its pole.",
+        12,
+        {
+            "push.control": {
+                "pole.position": 30.0,
+                "pole.velocity": 6.0,
+                "cart.position": 2.0,
+                "cart.velocity": 3.0,
+            }
+        },
+    ),
 }
 
 
-def rig(name: str, rng: np.random.Generator, knobs: Knobs) -> Apparatus:
+def file_rig(path: str) -> Rig:
+    """Return a rig of any model file: its first parameters, and speeds of joints, are causes.
+
+    Raises:
+        ModelError: It has fewer than three such parameters, or no joint with one number.
+    """
+    with World(path, expose=["*.mass", "*.damping", "*.stiffness", "*.frictionloss"]) as world:
+        every: list[Any] = [*world.model.variables]
+        scalars = [v for v in every if v.shape == () and getattr(v, "default", None) is not None]
+        states = [v.name for v in scalars if v.name.endswith(".position") and v.role == "state"]
+        parameters = {
+            v.name: (v.unit, 0.5 * float(v.default), 2.0 * float(v.default))
+            for v in scalars
+            if v.role == "parameter" and v.settable and float(v.default) > 0.0
+            if v.name.endswith((".mass", ".damping", ".stiffness", ".frictionloss"))
+        }
+    causes = dict([*parameters.items()][:4])
+    speeds = [state.replace(".position", ".velocity") for state in states[:3]]
+    causes |= dict.fromkeys(speeds, ("1/s", 0.3, 2.0))
+    if len(causes) < 4 or not states:
+        raise ModelError([f"{path} has too few parameters, or no joint with one number"])
+    return Rig(lambda _law, _k: path, causes, dict.fromkeys(states[-2:], "1"), 1.0, f"{path}.")
+
+
+def rig(made: Rig, rng: np.random.Generator, knobs: Knobs) -> Apparatus:
     """Make a rig; a hidden common cause moves all of its causes."""
-    made, k = RIGS[name], rng.uniform(0.7, 1.4, 3)
-    ties, follows, quantities = [Exogenous(name="driver", distribution=Box(-1.0, 1.0))], {}, []
+    k, quantities = rng.uniform(0.7, 1.4, 3), list[Quantity]()
+    ties, follows = [Exogenous(name="driver", distribution=Box(-1.0, 1.0))], dict[str, Any]()
     for cause, (unit, low, high) in made.causes.items():
         ties.append(Exogenous(name=f"own.{cause}", distribution=Box(-1.0, 1.0)))
         half = 0.5 * (high - low)
@@ -328,29 +480,32 @@ def rig(name: str, rng: np.random.Generator, knobs: Knobs) -> Apparatus:
         weights = (half * common, half * (1.0 - abs(common)))
         law = Linear(weights=weights, intercept=low + half)
         follows[cause] = Mechanism(law, parents=("driver", f"own.{cause}"))
-        quantities.append(Quantity(cause, unit, "", Outcome(cause, "first"), cause, low, high))
+        doc = "Where it is set, or is by itself, at the beginning."
+        quantities.append(Quantity(cause, unit, doc, Outcome(cause, "first"), cause, low, high))
     for i in range(knobs.distractors):
-        name_of = f"lamp{i}.brightness"
-        ties.append(Exogenous(name=name_of, unit="cd", distribution=Box(0.0, 1.0)))
-        quantities.append(Quantity(name_of, "cd", "", Outcome(name_of), name_of, 0.0, 1.0))
-    for what, unit in made.reads.items():
-        quantities += [
-            Quantity(f"{what}.{how}", unit, "", Outcome(what, how))
-            for how in ("final", "mean", "max")
-        ]
-    expose = [cause for cause in made.causes if not cause.endswith(".velocity")]
-    dt = made.seconds / 4
+        lamp = f"lamp{i}.brightness"
+        ties.append(Exogenous(name=lamp, unit="cd", distribution=Box(0.0, 1.0)))
+        quantities.append(Quantity(lamp, "cd", "A lamp.", Outcome(lamp), lamp, 0.0, 1.0))
+    outcomes = [(what, how) for what in made.reads for how in ("final", "mean", "max")]
+    for what, how in outcomes:
+        doc = f"The {how} value over the episode."
+        quantities.append(Quantity(f"{what}.{how}", made.reads[what], doc, Outcome(what, how)))
+    for command, of in made.agent.items():
+        follows[command] = Mechanism(Linear(weights=tuple(of.values())), parents=tuple(of))
     task = ModelTask(
-        made.xml(knobs.law, k), expose=expose, ties=ties, control_dt=dt, seconds=made.seconds
+        made.xml(knobs.law, k),
+        expose=[c for c in made.causes if not c.endswith((".velocity", ".position"))],
+        ties=ties,
+        control_dt=made.seconds / made.steps,
+        seconds=made.seconds,
     )
-    outcomes = [f"{what}.{how}" for what in made.reads for how in ("final", "mean", "max")]
     return Apparatus(
         World(task).given(follows),
         tuple(quantities),
-        {"policy": None, "steps": 4},
+        {"policy": None, "steps": made.steps},
         64,
         f"{made.doc} {LAWS[knobs.law].capitalize()}.",
-        edges=tuple((cause, what) for cause in made.causes for what in outcomes),
+        edges=tuple((cause, f"{what}.{how}") for cause in made.causes for what, how in outcomes),
     )
 
 
@@ -358,5 +513,12 @@ WORLDS: Mapping[str, tuple[Callable[[np.random.Generator, Knobs], Apparatus], st
     "equations": (equations, "A random acyclic model of equations."),
     "servo": (servos, "Arms whose servos follow one another."),
     "network": (network, "Masses on a random network of springs, for one step."),
-    **{name: (partial(rig, name), made.doc) for name, made in RIGS.items()},
+    **{name: (partial(rig, made), made.doc) for name, made in RIGS.items()},
 }
+
+
+def apparatus(world: str, rng: np.random.Generator, knobs: Knobs) -> Apparatus:
+    """Make the apparatus of a world of ``WORLDS``, or of a model file."""
+    if world in WORLDS:
+        return WORLDS[world][0](rng, knobs)
+    return rig(file_rig(world), rng, knobs)

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 import scm_world as sw
+from scm_world.fit.diagnosis import Term, recorded_for
+from scm_world.fit.recordings import MeasuredNumber, Measurements, RecordedRun
 
 DT, STEPS, SUBSTEPS = 0.01, 150, 5
 ARM = """
@@ -64,6 +66,11 @@ def stribeck(model: mujoco.MjModel, data: mujoco.MjData, *_: object) -> None:
     model.dof_frictionloss[0] = 0.03 + 0.06 * np.exp(-((data.qvel[0] / 0.5) ** 2))
 
 
+def delayed(_: mujoco.MjModel, data: mujoco.MjData, u: Any, step: int) -> None:
+    """Let a command act two control steps late."""
+    data.ctrl[0] = u[max(step - 2, 0)]
+
+
 @cache
 def world() -> sw.World:
     """Open the model, which has none of these terms."""
@@ -74,6 +81,7 @@ def world() -> sw.World:
     ("act", "late", "term", "value"),
     [
         (stribeck, 0, "Coulomb friction that falls with speed", ("hinge.stribeck_speed", 0.5)),
+        (delayed, 0, "delay of the command", ("motor.control_delay", 2.0)),
         (nothing, 2, "lag of the sensor", ("hinge.position lag", 2.0)),
     ],
 )
@@ -107,6 +115,24 @@ def test_no_term_is_claimed_where_the_fit_explains_the_recording() -> None:
     stopped = fit.diagnose(progress=stop)
     assert len(stopped.fits) == 2
     assert "Stopped after 2 of" in str(stopped)
+
+
+def test_commands_within_control_steps_stay_where_they_were_sent_in_shorter_ones() -> None:
+    """What acts in each physics step is the same, and an added motor has no command."""
+    times, sent = np.array([0.0, 0.3, 1.5, 3.1]), np.array([[1.0], [-2.0], [0.5], [3.0]])
+    coarse = RecordedRun(np.zeros((4, 1)), np.arange(5), np.zeros((5, 1)), sent=(times, sent))
+    measured = Measurements((coarse,), (MeasuredNumber("q", "hinge.position", 0, "rad"),), DT)
+    option = f'timestep="{DT / SUBSTEPS}"'
+    more = '<motor name="other" joint="hinge" ctrlrange="-1 1"/></actuator>'
+    text = ARM.replace('timestep="0.002"', option).replace("</actuator>", more)
+    fine, steps = recorded_for(measured, Term(("", ""), sw.World(text, control_dt=DT / SUBSTEPS)))
+    assert steps == SUBSTEPS
+    (run,) = fine.runs
+    acting = run.acting(np.zeros(2), np.arange(4 * SUBSTEPS), 1)[:, 0]
+    wanted = coarse.acting(np.zeros(1), np.arange(4), SUBSTEPS).ravel()
+    np.testing.assert_allclose(acting[:, 0], wanted, atol=1e-12)
+    assert not acting[:, 1].any()
+    assert run.instants.tolist() == [0, 5, 10, 15, 20]
 
 
 def test_what_needs_a_file_is_not_tried_on_a_step_function() -> None:

@@ -168,3 +168,23 @@ def test_two_processes_make_the_same_questions_and_a_key_makes_others() -> None:
     ]
     assert runs[0] == runs[1]
     assert len({*runs[0]}) == 2
+
+
+def test_the_command_runs_replays_and_plays(tmp_path: Path) -> None:
+    """A saved run is repeated; a person types calls of tools."""
+    from typer.testing import CliRunner
+
+    from scm_world.cli.app import app
+
+    path, run = str(tmp_path / "run.json"), CliRunner()
+    done = run.invoke(app, ["lab", "run", "--seed", "3", "--agent", "ideal", "--out", path])
+    assert done.exit_code == 0, done.output
+    assert '"score": 1.0' in done.output
+    assert "identical" in run.invoke(app, ["lab", "replay", path]).output
+    typed = 'observe {"n": 2}\nobserve {\nsubmit {"answer": 0, "confidence": 0.1}\n'
+    played = run.invoke(app, ["lab", "play", "--seed", "3"], input=typed)
+    assert played.exit_code == 0, played.output
+    assert "not JSON" in played.output
+    assert '"brier"' in played.output
+    assert "counterfactual" in run.invoke(app, ["lab", "list"]).output
+    assert run.invoke(app, ["lab", "replay"]).exit_code == 2
