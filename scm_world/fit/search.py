@@ -234,6 +234,9 @@ class Minima:
     ) -> Result:
         """Search a minimum from a fit of other parameters, or from the measurements.
 
+        Where joined segments do not explain what segments on their own do, a thorough search is
+        repeated from other values: sticking friction has many minima.
+
         Args:
             active: Numbers of the parameters.
             begin: The fit of other parameters.
@@ -250,7 +253,42 @@ class Minima:
             scaled[:] = 0.0
             scaled[[*active]] = values
             scaled = self.problem.allowed(np.zeros(len(scaled)), scaled)
-        return self._joined([*active], scaled, starts, self.problem.noise, 2, thorough, enough)
+        active, rng, tries = [*active], np.random.default_rng(0), SEARCHES if thorough else 1
+        found = self._joined(active, scaled, starts, self.problem.noise, 2, thorough, enough)
+        for number in range(1, tries if len(active) else 1):
+            if found.joined:
+                break
+            scaled = self._elsewhere(active, found, rng, ELSEWHERE)
+            least = UNJOINED * degrees(found.at.made)  # above, segments do not join there, either
+            other = self._beside(active, found, scaled, found.noise, number, least)
+            found = other if other.joined else found
+        return found
+
+    def _elsewhere(
+        self, active: list[int], best: Result, rng: np.random.Generator, least: float
+    ) -> Floats:
+        """Draw scaled parameters around a minimum, with a least standard deviation.
+
+        Directions in which the residuals do not change are left by little.
+        """
+        problem, scaled, along = self.problem, best.at.scaled.copy(), projected(best.first.made)[1]
+        sizes, directions = np.linalg.svd(along.T @ along)[1:]
+        far = np.where(sizes > PRIOR**-2, 2.0 / np.sqrt(np.maximum(sizes, TINY)), 0.0)
+        scaled[active] += (np.maximum(far, least) * rng.normal(size=len(active))) @ directions
+        return problem.allowed(best.at.scaled, problem.within(scaled))
+
+    def _beside(
+        self,
+        active: list[int],
+        best: Result,
+        scaled: Floats,
+        noise: Floats,
+        number: int,
+        enough: float = np.inf,
+    ) -> Result:
+        """Search a minimum from other parameters; each second time from measured start states."""
+        starts = self._guess if number % 2 else best.first.starts
+        return self._joined(active, scaled, starts, noise, 2 + number % 2, True, enough)
 
     def played(self, at: Minimum, unfitted: Minimum | None = None) -> Floats:
         """Return how far runs that are played from their first row are from the measurements.
@@ -295,8 +333,6 @@ class Minima:
     ) -> Result:
         """Repeat a search from other starts until the best minimum was found twice.
 
-        Directions in which the residuals do not change are left by little.
-
         Where the residuals are smooth, and explained, it is not repeated.
 
         Args:
@@ -307,21 +343,14 @@ class Minima:
                 begin farther away.
             discount: By how much correlated residuals increase the variance.
         """
-        rng, active, problem = np.random.default_rng(0), [*active], self.problem
-        changed = np.abs(np.log(best.noise / problem.noise)).max() > np.log(OTHER)
+        rng, active = np.random.default_rng(0), [*active]
+        changed = np.abs(np.log(best.noise / self.problem.noise)).max() > np.log(OTHER)
         every = [best]
         for number in range(1, SEARCHES):
             if same or (best.smooth and not changed and not misfit):
                 break
-            least, scaled = FARTHER if misfit else ELSEWHERE, best.at.scaled.copy()
-            along = projected(best.first.made)[1]
-            sizes, directions = np.linalg.svd(along.T @ along)[1:]
-            far = np.where(sizes > PRIOR**-2, 2.0 / np.sqrt(np.maximum(sizes, TINY)), 0.0)
-            scaled[active] += (np.maximum(far, least) * rng.normal(size=len(active))) @ directions
-            scaled = problem.allowed(best.at.scaled, problem.within(scaled))
-            starts = self._guess if number % 2 else best.first.starts
-            join = 2 + number % 2
-            other = self._joined(active, scaled, starts, best.noise, join, True)
+            scaled = self._elsewhere(active, best, rng, FARTHER if misfit else ELSEWHERE)
+            other = self._beside(active, best, scaled, best.noise, number)
             every.append(other)
             same = other.like(best, active, discount) or (same and other.loss > best.loss)
             best = min(best, other, key=lambda one: one.loss)

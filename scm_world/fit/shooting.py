@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import Floats, Integers
-from scm_world.errors import EngineFailure
+from scm_world.errors import EngineFailure, InterventionError
 from scm_world.fit.problem import SHORT, STEP, Simulated, Simulator, Window
 from scm_world.fit.recordings import (
     LEAST,
@@ -264,6 +264,10 @@ class Shooting(Simulator):
         """Set the parameters of a twin for a set-up; it is in any state afterwards.
 
         Those that it has from an earlier call are left as they are.
+
+        Raises:
+            InterventionError: The world refuses a value, or its engine takes another one, such as
+                an axis of unit length.
         """
         world, known = self._batch.world(row), self._known[row]
         if self._apart is not None:
@@ -275,7 +279,11 @@ class Shooting(Simulator):
             values[name].reshape(-1)[place] = value
         new = {n: v for n, v in values.items() if n not in known or (v != known[n]).any()}
         if new:
-            world.do(new)
+            try:
+                world.do(new)
+            except EngineFailure as error:
+                said, name = f"{error}", ", ".join(new)
+                raise InterventionError(said, variable=name) from error
         self._known[row] = values
 
     def _key(self, run: int, scaled: Floats) -> bytes:

@@ -23,6 +23,7 @@ SEGMENTS = 32  # of a recording that are simulated
 ALONE = 16  # angles of which each may be in degrees alone, at most
 POOR = 0.7  # least share of the motion that is not simulated, if a reading is doubted
 BETTER = 0.7  # largest share in another reading, relative to that
+MOTION = 1.0  # the same, from which on a reading explains no motion
 TURNED = 0.3  # the same of quaternions, which have no scale that would tell
 BEGINNING = 0.95  # the same, if they begin at the default orientation in the other reading only
 TEN = 10.0  # times less of the motion is not simulated with another factor that is named
@@ -70,7 +71,8 @@ def check_units(world: World, measured: Measurements) -> None:
 
     Segments of about ten rows are simulated from their measured start states. A start state
     determines neither changes of velocities, nor positions whose velocities are measured. A reading
-    is doubted where most of this motion is not simulated, and clearly more of it in another one.
+    is doubted where most of this motion is not simulated, and clearly more of it in another one,
+    which explains motion: it leaves less than there is.
     The reading of a quaternion is doubted where the recording begins at the default orientation in
     the other reading only.
 
@@ -98,7 +100,7 @@ def check_units(world: World, measured: Measurements) -> None:
             shooting.runs = tuple(map(reading.converted, runs))
             other = _compared(shooting, segments)
             after = other.share(reading.places)
-            if after < most * before:
+            if after < min(most * before, MOTION):
                 found.append((other.total, before, after, reading))
     if found:
         _, before, after, reading = min(found, key=lambda one: one[0])
