@@ -15,6 +15,7 @@ from scm_world._arguments import load, one_of
 from scm_world.cli import console, options
 from scm_world.cli.options import load_system, parse_assignments, parse_outcome, tag
 from scm_world.errors import EngineError, ScmWorldError, UnknownOption, UnreadableFile
+from scm_world.fit.recordings import LACKING
 from scm_world.runs.canvas import png
 from scm_world.runs.files import write_whole
 
@@ -499,6 +500,17 @@ def _setups(given: list[str], n: int) -> list[dict[str, object]]:
     return found
 
 
+def _predicted(found: sw.Fit, recording: str, names: dict[str, Any]) -> Any:
+    """Predict a recording, which may lack renamed columns: those that were fitted have them."""
+    try:
+        return found.predict(recording, **names)
+    except UnknownOption as error:
+        if error.option != LACKING:
+            raise
+        columns = {old: new for old, new in names["columns"].items() if old != error.value}
+        return _predicted(found, recording, {**names, "columns": columns})
+
+
 def fit(
     task: options.System,
     recordings: Annotated[list[str], typer.Argument(metavar="RECORDING...")],
@@ -588,7 +600,7 @@ def fit(
             found, frames = deviation.fit, {"explanation": deviation.table}
         if found.interrupted:
             predict, request, suggest = None, {}, 0
-        predictions = {other: found.predict(other, **names) for other in predict or ()}
+        predictions = {other: _predicted(found, other, names) for other in predict or ()}
         other = found.counterfactual(request, at=at, run=run, seed=asked.seed) if request else None
         diagnosis = found.diagnose(progress=tell) if diagnose else None
         try:

@@ -199,7 +199,22 @@ def fitted(minima: Minima, active: Sequence[int], first: Result | None = None) -
         away = other[[*active]] - found.scaled
         margin = np.minimum(found.linear_reach, reach.max(axis=1))[:, None]
         reach = np.maximum(reach, np.array([-away, away]).T + margin)
+    if found.still and _usual(minima, best, active, found):
+        reach[:] = np.inf
     return dataclasses.replace(found, reach=reach, played=minima.played(best.at))
+
+
+def _usual(minima: Minima, best: Result, active: Sequence[int], found: Fit) -> bool:
+    """Return whether the defaults explain the recording as well as the fit, by the BIC.
+
+    Two more parameters count for the oscillations of which a search finds the nearest in noise.
+    """
+    scaled = best.at.scaled.copy()
+    scaled[[*active]] = 0.0
+    squares = LeastSquares(minima.problem, minima.problem.windows, best.noise, ())
+    more = minima.search(squares, scaled, best.at.starts).squares.sum() - found.squares
+    penalty = (len(active) + 2) * np.log(len(found.residual))
+    return bool(more < penalty * found.discount)
 
 
 def covering(minima: Minima, found: Fit, others: Sequence[Minimum]) -> Fit:

@@ -62,6 +62,7 @@ KINDS = (
     "a dataset of Minari or an episode of one",
     "a list of these",
 )
+LACKING = "column of the table"  # of an error: a renamed one that no table has
 READOUTS = (".position", ".orientation", ".linear_velocity", ".angular_velocity", ".value")
 
 
@@ -439,7 +440,7 @@ def read_recording(
         raise UnknownOption("recording", recording, ("one or more runs",))
     if missing := how.missing(names):
         allowed = [*names, *dict.fromkeys(has.values())]
-        raise UnknownOption("column of the table", missing[0], allowed)
+        raise UnknownOption(LACKING, missing[0], allowed)
     for label, frame, _ in frames:
         faults = [*_faults(world, frame)]
         faults += [has[label]] if faults and label in has else []

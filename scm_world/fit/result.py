@@ -450,15 +450,39 @@ class Fit:
         """
         if not self._replayed[0] > WORSE:
             return False
+        left, whole, _ = self._around
+        return bool(np.mean(np.minimum(left / np.maximum(whole, 1e-300), 1.0)) > LEFT)
+
+    @property
+    def _around(self) -> tuple[Floats, Floats, int]:
+        """Squares of each column that the fit leaves, and that means do, (columns,).
+
+        The means are those of each column in each window; the third is how many there are.
+        """
         (row, column), n = self.measured.cells, len(self.columns)
         values, where = self.measured.values[row, column], self._windows * n + column
-        count = np.maximum(np.bincount(where), 1)
-        away = (values - (np.bincount(where, values) / count)[where]) ** 2
+        count = np.bincount(where)
+        away = (values - (np.bincount(where, values) / np.maximum(count, 1))[where]) ** 2
         left, whole = (
             by_column(column, squares, n)[0]
             for squares in ((self.residual * self.noise[column]) ** 2, away)
         )
-        return bool(np.mean(np.minimum(left / np.maximum(whole, 1e-300), 1.0)) > LEFT)
+        return left, whole, int((count > 0).sum())
+
+    @property
+    def still(self) -> bool:
+        """Whether a constant in each window explains the recording as well as the fit.
+
+        Source:
+            Schwarz, *Estimating the dimension of a model*, Annals of Statistics 1978: each
+            parameter more must reduce -2 log likelihood by the logarithm of the measurements.
+        """
+        left, whole, means = self._around
+        size, column = len(self.residual), self.measured.cells[1]
+        count = by_column(column, self.residual, len(self.columns))[1]
+        least = count * self.measured.least**2
+        gain = (count * np.log(np.maximum(whole, least) / np.maximum(left, least))).sum()
+        return bool(gain < (size - self.degrees - means) * np.log(size))
 
     @typed
     def predict(
