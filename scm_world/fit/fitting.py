@@ -187,7 +187,8 @@ def fitted(minima: Minima, active: Sequence[int], first: Result | None = None) -
     """
     best = first or minima.found(active)
     found = described(minima, active, best)
-    about: dict[str, Any] = {"misfit": not found.explains, "discount": found.discount}
+    about: dict[str, Any] = {"misfit": not found.explains or found.correlated}
+    about["discount"] = found.discount
     for _ in range(BETTER):
         best = minima.repeated(active, best, **about)
         found = described(minima, active, best)

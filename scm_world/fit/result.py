@@ -67,6 +67,7 @@ CONFIDENCE = 0.95
 
 DETERMINED = 0.25  # largest standard error of a determined combination: a share of the value
 MISFIT = 1.5  # least residual that the noise does not explain, in standard deviations of it
+CORRELATED = 2.0  # standard errors of a correlation of residuals that is none of noise
 AWAY = 0.5  # of the spread of a state in the recording, at which it is far from rest
 WORSE = 1.1  # times the error of the unfitted world, with which a fit replays worse than it
 LEFT = 0.5  # share of the variance within windows that a fit leaves which does not follow them
@@ -233,6 +234,17 @@ class Fit:
     def explains(self) -> bool:
         """Whether the residuals are as small as the noise, so that the model can be true."""
         return max(self.misfit.values()) < MISFIT
+
+    @property
+    def correlated(self) -> bool:
+        """Whether consecutive residuals of a column are correlated, which noise is not.
+
+        Source:
+            von Neumann, see ``roughness``: the ratio has a standard deviation of about 1 : √n.
+        """
+        squares, count = by_column(self.measured.cells[1], self.residual**2, len(self.columns))
+        ratio = self.roughness**2 / np.maximum(squares / count, 1e-300)
+        return bool((1.0 - ratio > CORRELATED / np.sqrt(count)).any())
 
     @cached_property
     def discount(self) -> float:

@@ -347,9 +347,11 @@ class Minima:
         changed = np.abs(np.log(best.noise / self.problem.noise)).max() > np.log(OTHER)
         every = [best]
         for number in range(1, SEARCHES):
-            if same or (best.smooth and not changed and not misfit):
+            if not misfit and (same or (best.smooth and not changed)):
                 break
-            scaled = self._elsewhere(active, best, rng, FARTHER if misfit else ELSEWHERE)
+            scaled = self._elsewhere(
+                active, best, rng, FARTHER if misfit and number % 2 else ELSEWHERE
+            )
             other = self._beside(active, best, scaled, best.noise, number)
             every.append(other)
             same = other.like(best, active, discount) or (same and other.loss > best.loss)
