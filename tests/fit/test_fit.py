@@ -649,6 +649,7 @@ def test_the_command(damped: pd.DataFrame, tmp_path: Path, monkeypatch: Any) -> 
     """It prints the table, and writes results with versions and seed."""
     monkeypatch.chdir(tmp_path)
     Path("pendulum.xml").write_text(PENDULUM)
+    damped.to_csv("plain.csv", index=False)  # without the column that is renamed
     spoiled = damped.rename(columns={"motor.control": "torque"}).assign(temperature=20.0)
     spoiled.to_csv("run.csv", index=False, sep=";", decimal=",")
     damped = spoiled
@@ -657,6 +658,7 @@ def test_the_command(damped: pd.DataFrame, tmp_path: Path, monkeypatch: Any) -> 
     more = ["--parameters", "*.damping", "--noise", "hinge.position=0.001"]
     asked = ["--suggest", "1", "--steps", "40", "--limits", "hinge.position=-2,2"]
     asked += ["--do", "pole.mass=0.3", "--at", "10", "--run", "1", "--predict", "run.csv"]
+    asked += ["--predict", "plain.csv"]
     more += ["--column", "torque=motor.control", "--ignore", "temp*"]
     asked += ["--begins", "hinge.velocity=0,1", "--held-out", "0.3"]
     done = CliRunner().invoke(app, [*words, *more, *asked], catch_exceptions=False)
@@ -671,7 +673,7 @@ def test_the_command(damped: pd.DataFrame, tmp_path: Path, monkeypatch: Any) -> 
     assert found["fit"][0]["value"] == pytest.approx(0.02, rel=0.02)
     assert found["backend"] == "mujoco"
     assert found["replay"][0]["fit"] < 0.3 * found["replay"][0]["constant"]
-    assert {*found["predictions"]} == {"run.csv", "held out"}
+    assert {*found["predictions"]} == {"run.csv", "plain.csv", "held out"}
     assert found["predictions"]["run.csv"][0]["skill"] > 0.9
     assert "hinge.velocity at the start" in found["noise"]
     assert {"seed", "versions", "noise", "remarks"} <= {*found}

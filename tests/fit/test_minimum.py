@@ -203,3 +203,54 @@ def test_a_number_of_a_vector_deviates_alone() -> None:
     (experiment,) = fit.suggest(1, steps=20)
     assert "no experiment seems to determine gravity[1]" in str(experiment)
     assert "gravity[1] 3" not in str(experiment)
+
+
+ARM = """
+<mujoco model="arm"><option timestep="0.002" integrator="implicitfast"/>
+  <worldbody><body name="upper">
+    <joint name="shoulder" axis="0 1 0" damping="0.09" armature="0.01"/>
+    <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="0.5"/>
+    <body name="lower" pos="0 0 -0.3">
+      <joint name="elbow" axis="0 1 0" damping="0.02" range="-2 2"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.25" size="0.02" mass="0.3"/>
+    </body>
+  </body></worldbody>
+  <actuator><motor name="one" joint="shoulder" gear="2" ctrlrange="-1 1"/>
+    <motor name="two" joint="elbow" ctrlrange="-1 1"/></actuator>
+</mujoco>
+"""
+
+
+def swung(rows: int, share: float, seed: int) -> dict[str, Any]:
+    """Return a noisy recording of the arm whose shoulder sticks and whose elbow bumps at 2°, by plain MuJoCo."""
+    model = mujoco.MjModel.from_xml_string(ARM)
+    model.dof_frictionloss[0], model.body_mass[2] = 0.05, 0.45
+    data, rng, found = mujoco.MjData(model), np.random.default_rng(seed), []
+    commands = share * np.repeat(rng.uniform(-0.6, 0.6, (rows // 5 + 1, 2)), 5, axis=0)[:rows]
+    for data.ctrl[:] in commands:
+        found.append(data.qpos + NOISE * rng.normal(size=2))
+        mujoco.mj_step(model, data, 10)
+    names, joints = ("one.control", "two.control"), ("shoulder.position", "elbow.position")
+    columns = dict(zip((*names, *joints), np.hstack([commands, found]).T, strict=True))
+    return {"time": 0.02 * np.arange(len(commands)), **columns}
+
+
+@pytest.mark.parametrize("seed", [3, 10])
+def test_another_minimum_is_searched_where_a_joint_sticks_or_bumps(seed: int) -> None:
+    """Minima with other impacts leave residuals that do not join, or that are correlated."""
+    world = sw.World(ARM, control_dt=0.02).given({"lower.mass": 0.45})
+    fit = world.fit(swung(60, 1.0, seed), ["elbow.damping", "shoulder.frictionloss"])
+    for name, true in (("elbow.damping", 0.02), ("shoulder.frictionloss", 0.05)):
+        row = fit.table.set_index("parameter").loc[name]
+        assert row.low < true < row.high
+        assert row.value == pytest.approx(true, rel=0.15)
+        assert row.determined
+
+
+def test_noise_of_what_hangs_still_determines_nothing() -> None:
+    """A search finds an oscillation in it, which is no motion."""
+    world = sw.World(ARM, control_dt=0.02)
+    fit = world.fit(swung(50, 0.0, 7), ["lower.mass", "shoulder.frictionloss"])
+    assert fit.still
+    assert not fit.table.determined.any()
+    assert fit.table.low.isna().all()
