@@ -191,9 +191,9 @@ def test_equal_residuals_share_a_cause() -> None:
 def test_two_processes_make_the_same_questions_and_a_key_makes_others() -> None:
     """Digests cover the description and the answer."""
     program = (
-        "from scm_world import lab\n"
-        "print(lab.question('effect', 'equations', 5).digest)\n"
-        "print(lab.question('effect', 'equations', 5, key='a secret of a test').digest)\n"
+        "import scm_world as sw\n"
+        "print(sw.lab.question('effect', 'equations', 5).digest)\n"
+        "print(sw.lab.question('effect', 'equations', 5, key='a secret of a test').digest)\n"
     )
     runs = [
         subprocess.run(  # noqa: S603 # our own text
