@@ -417,7 +417,7 @@ def _control(bench: Bench, rng: np.random.Generator) -> Made:
     def reached(share: float) -> float:
         return bench.means({**held, cause: _inside(bench, cause, share)})[outcome]
 
-    shares, fine = np.linspace(0.02, 0.98, 7), np.linspace(0.02, 0.98, 1001)
+    shares, fine = np.linspace(0.02, 0.98, 13), np.linspace(0.02, 0.98, 1001)
     found = np.array([reached(share) for share in shares])
     if np.ptp(found) < 0.4 * bench.spread[outcome]:
         raise Unusable(["the outcome hardly follows"])
