@@ -76,7 +76,7 @@ def stronger(question: Question) -> dict[str, Any]:
     match question.kind:
         case "control":
             ends = question.bench.ends(query["cause"])
-            place = {share: ends[0] + share * (ends[1] - ends[0]) for share in (0.12, 0.88)}
+            place = {share: ends[0] + share * (ends[1] - ends[0]) for share in (0.12, 0.3, 0.88)}
             return {f"at {share:.0%}": {query["cause"]: x} for share, x in place.items()}
         case "explanation":
             usual = query["usual"]
@@ -225,7 +225,7 @@ def manifests(made: dict[str, Path]) -> None:
                 continue
             about = json.loads(path.read_text())["content"]
             trivial = about.get("trivial") or trivial_tables(made[name] / part, about)
-            draws = {"draws": about["draws"]} if "draws" in about else {}
+            draws = {n: about[n] for n in ("seeds", "draws", "skipped") if n in about}
             recipe.update(sha256=about["sha256"], trivial=trivial, **draws)
         text = as_json({**ABOUT[name], **found, "parts": parts}, 2)
         (MANIFESTS / f"{name}.json").write_text(text + "\n")
