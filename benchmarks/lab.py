@@ -4,6 +4,7 @@
 
     python -m benchmarks.lab questions --n 25  # of each kind: certificates and CPU time
     python -m benchmarks.lab truth             # their answers, by an independent script
+    python -m benchmarks.lab names             # the most frequent answers that are names
     python -m benchmarks.lab suites --made DIR # the manifests, with the hashes of made folders
 
 The figures are in ``lab.json``. Questions are those of ``lab-1``, in the order of its parts.
@@ -14,7 +15,9 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
+from contextlib import suppress
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +29,7 @@ from scm_world import lab
 from scm_world.discovery.data import load
 from scm_world.discovery.learners.registry import learn
 from scm_world.lab import suites
-from scm_world.lab.questions import Question
+from scm_world.lab.questions import Question, Unusable, made
 from scm_world.runs.pool import Pool
 
 HERE = Path(__file__).parent
@@ -76,7 +79,7 @@ def stronger(question: Question) -> dict[str, Any]:
     match question.kind:
         case "control":
             ends = question.bench.ends(query["cause"])
-            place = {share: ends[0] + share * (ends[1] - ends[0]) for share in (0.12, 0.88)}
+            place = {share: ends[0] + share * (ends[1] - ends[0]) for share in (0.12, 0.3, 0.88)}
             return {f"at {share:.0%}": {query["cause"]: x} for share, x in place.items()}
         case "explanation":
             usual = query["usual"]
@@ -155,6 +158,19 @@ def table(rows: list[dict[str, Any]]) -> dict[str, Any]:
     return found
 
 
+def names() -> dict[str, dict[str, dict[str, int]]]:
+    """Count answers that are names, of 16 draws of each rig that need not be certified."""
+    found = dict[str, dict[str, dict[str, int]]]()
+    for kind, world in product(("explanation", "diagnosis"), lab.offers("explanation")):
+        counts = Counter[str]()
+        for seed in range(1, 41):
+            with suppress(Unusable):
+                if counts.total() < 16:
+                    counts[made(kind, world, seed, "L2", lab.Knobs(), 0, None).answer] += 1
+        found.setdefault(kind, {})[world] = dict(counts.most_common())
+    return found
+
+
 # --- manifests ------------------------------------------------------------------------------------
 
 
@@ -225,7 +241,7 @@ def manifests(made: dict[str, Path]) -> None:
                 continue
             about = json.loads(path.read_text())["content"]
             trivial = about.get("trivial") or trivial_tables(made[name] / part, about)
-            draws = {"draws": about["draws"]} if "draws" in about else {}
+            draws = {n: about[n] for n in ("seeds", "draws", "skipped") if n in about}
             recipe.update(sha256=about["sha256"], trivial=trivial, **draws)
         text = as_json({**ABOUT[name], **found, "parts": parts}, 2)
         (MANIFESTS / f"{name}.json").write_text(text + "\n")
@@ -234,7 +250,7 @@ def manifests(made: dict[str, Path]) -> None:
 def main() -> None:
     """Run one part."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("part", choices=("questions", "truth", "suites"))
+    parser.add_argument("part", choices=("questions", "truth", "names", "suites"))
     parser.add_argument("--n", type=int, default=25)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--rows", type=Path, default=HERE / "lab_questions.jsonl")
@@ -250,7 +266,11 @@ def main() -> None:
                 outcome = confirm(Question.of(row["spec"]))["confirmed"]
                 count = found[row["spec"]["kind"]].setdefault("confirmed", {})
                 count[str(outcome)] = count.get(str(outcome), 0) + 1
-        RESULTS.write_text(as_json({"questions": found}) + "\n")
+        known = json.loads(RESULTS.read_text())
+        RESULTS.write_text(as_json({**known, "questions": found}) + "\n")
+    if given.part == "names":
+        known = json.loads(RESULTS.read_text())
+        RESULTS.write_text(as_json({**known, "names": names()}) + "\n")
     if given.part == "suites":
         manifests({path.name: path for path in given.made})
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 
 if TYPE_CHECKING:
+    from scm_world import lab as lab
     from scm_world.discovery import discover as discover
     from scm_world.env import ScmWorldEnv as ScmWorldEnv
     from scm_world.env import check as check
@@ -63,6 +64,7 @@ _NAMES = {
     "Natural Null Parent Reaches Scale Shift",
 }
 _HOMES = {name: module for module, names in _NAMES.items() for name in names.split()}
+_HOMES["lab"] = "lab"  # the module itself
 
 __all__ = list(_HOMES)
 
@@ -70,7 +72,8 @@ __all__ = list(_HOMES)
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module 'scm_world' has no attribute {name!r}")
-    return getattr(importlib.import_module(f"scm_world.{_HOMES[name]}"), name)
+    home = importlib.import_module(f"scm_world.{_HOMES[name]}")
+    return home if name == _HOMES[name] else getattr(home, name)
 
 
 def __dir__() -> list[str]:

@@ -560,7 +560,15 @@ MODULES = (
     ".tasks",
 )
 RESULTS = {
-    *("Counterfactuals", "DiscoveryReport", "Effect", "Fit", "Identification", "Otherwise"),
+    *(
+        "Counterfactuals",
+        "Deviation",
+        "DiscoveryReport",
+        "Effect",
+        "Fit",
+        "Identification",
+        "Otherwise",
+    ),
     *("Progress", "Snapshot", "Verification"),
 }
 """What questions return, and no user makes."""

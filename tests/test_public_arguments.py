@@ -34,6 +34,7 @@ from scm_world import (
     evaluation,
     fit,
     graph,
+    lab,
     models,
     policies,
     queries,
@@ -43,6 +44,7 @@ from scm_world import (
 from scm_world import env as environments
 from scm_world.discovery import data, learners, problems, representations
 from scm_world.errors import ModelError, ScmWorldError
+from scm_world.lab.questions import made as made_question
 from scm_world.policies import planning
 from scm_world.queries.local import local_graph
 from scm_world.tasks import families
@@ -407,6 +409,24 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
         "evaluation": judged, "protocol": "P1", "episode": 0, "metric": None, "versus": "A",
         "policy": None, "task": None, "trusted": (), "progress": None,
     }  # fmt: skip
+    # Laboratories.
+    asked_for = made_question("effect", "equations", 0, "L2", lab.Knobs(), 0, None)
+    yield lab.Knobs, dataclasses.asdict(lab.Knobs())
+    yield lab.Laboratory, {"question": asked_for}
+    yield lab.LabEnv, {
+        "kind": "effect", "world": "equations", "level": "L2", "seeds": 1, "first": 0,
+        "experiments": 8, "n": 10,
+    }  # fmt: skip
+    yield lab.certify, {"question": asked_for}
+    yield lab.offers, {"kind": "effect"}
+    yield lab.play, {"agent": "random", "question": asked_for}
+    yield lab.question, {
+        "kind": "effect", "world": "equations", "seed": 0, "level": "L2", "key": None,
+        "noise": 0.02,
+    }  # fmt: skip
+    yield lab.replay, {"path": lab.play("random", asked_for).save(folder / "run.json"), "key": None}
+    yield lab.scores, {"runs": [lab.play("random", asked_for)]}
+    yield lab.suite, {"name": "physics-1"}
     # Policies.
     layer = policies.Layer(np.zeros((56, 9), np.float32), np.zeros(9, np.float32))
     about = policies.PolicyAbout(task="pushing")

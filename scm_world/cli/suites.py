@@ -52,6 +52,8 @@ def make(name: Name, *, key: Path = None, out: options.Out = None, jobs: options
         f"{name}: {len(made.parts)} parts, {rows} rows; the manifest has hashes of {known} parts, "
         f"and {known - len(made.differ)} are the same"
     )
+    if skipped := sum(part.get("skipped", 0) for part in made.parts.values()):
+        console.say(f"seeds without a question, of which others took the place: {skipped}")
     if made.differ:
         shown = ", ".join(made.differ[:SHOWN]) + ", …" * (len(made.differ) > SHOWN)
         other = "; ".join(made.versions) or "the versions are the same"

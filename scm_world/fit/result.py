@@ -615,8 +615,12 @@ class Fit:
             :SHOWN
         ]:
             time = self.runs[run].begin + self.measured.control_dt * self.runs[run].instants[row]
-            number = f" {row}" * (self.measured.every == 1)
-            where = f"row{number}{f' of run {run}' * (len(self.runs) > 1)} ({time:.4g} s)"
+            place = (
+                f"row {row} ({time:.4g} s)"
+                if self.measured.every == 1
+                else f"the row at {time:.4g} s"
+            )
+            where = place + f" of run {run}" * (len(self.runs) > 1)
             found.append(
                 f"{self.columns[column].name} = {value:.4g} in {where} is {off:.3g} from "
                 f"the fit, {abs(off) / self.noise[column]:.3g} times the noise: it was left out"

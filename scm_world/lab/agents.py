@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Callable, Mapping
 from itertools import combinations, pairwise
 from typing import Any
@@ -34,7 +36,7 @@ class _Known:
     """What the description of a question says."""
 
     def __init__(self, room: Laboratory) -> None:
-        self.room, about = room, room.describe()
+        self.room, self.about = room, (about := room.describe())
         self.kind, self.query, self.budget = about["kind"], about["query"], about["remaining"]
         self.variables = about["variables"]
         self.ends = {v["name"]: v["settable"] for v in self.variables if v["settable"]}
@@ -141,7 +143,7 @@ def _confounded(known: _Known, edges: list[list[str]], tables: Mapping[str, Colu
     return [
         [a, b]
         for a, b in combinations(left, 2)
-        if abs(np.arctanh(np.corrcoef(left[a], left[b])[0, 1])) * np.sqrt(n - 3) > 3.6
+        if np.arctanh(min(abs(np.corrcoef(left[a], left[b])[0, 1]), 0.999)) * np.sqrt(n - 3) > 3.6
     ]
 
 
@@ -303,7 +305,8 @@ def trivial(question: Question) -> dict[str, Any]:
         case _:
             low, high = known.ends[cause]
             line_to = float(np.clip((q["target"] - level) / slope, low, high))
-            return {"guess": {cause: middle}, "regression": {cause: line_to}}
+            some = {"low": low, "middle": middle, "high": high, "regression": line_to}
+            return {name: {cause: value} for name, value in some.items()}
 
 
 def certify(question: Question) -> dict[str, Any]:
@@ -322,12 +325,13 @@ def certify(question: Question) -> dict[str, Any]:
 
 def guess(room: Laboratory) -> None:
     """Set one variable at random, five times, and answer at random."""
-    rng = np.random.default_rng(room.question.seed)
     known = _Known(room)
+    told = hashlib.sha256(json.dumps(known.about, sort_keys=True).encode()).digest()
+    rng = np.random.default_rng(int.from_bytes(told[:8]))
     for _ in range(5):
         name = str(rng.choice([*known.ends]))
         room.experiment({name: float(rng.uniform(*known.ends[name]))})
-    if room.question.late:
+    if known.query is None:  # it is asked when the budget is spent
         while room.remaining:
             room.observe(min(200, room.remaining))
     q = room.describe()["query"]

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world._arguments import one_of, whole_number
+from scm_world._arguments import one_of, typed, whole_number
 from scm_world._types import Floats
 from scm_world.errors import Forbidden, UnknownOption
 from scm_world.lab.laboratory import Laboratory
@@ -25,6 +25,7 @@ def _questions(kind: str, world: str, level: str, first: int, n: int) -> tuple[Q
 
 
 @final
+@typed
 class LabEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.int64]]):
     """Choose experiments; a fixed estimator answers the question from their readings.
 

@@ -263,6 +263,7 @@ def replay(path: str | PathLike[str], key: str | None = None) -> list[str]:
     return found
 
 
+@typed
 def scores(runs: Iterable[Laboratory]) -> dict[str, dict[str, Interval]]:
     """Return means over questions by kind: of score, share of the budget, and Brier score."""
     by_kind: dict[str, list[dict[str, float]]] = {}

@@ -38,7 +38,7 @@ SHORTEST = 16
 
 
 class Unusable(ModelError):
-    """A draw that makes no question."""
+    """A draw, or a seed, that makes no question."""
 
 
 # --- what an agent sees ---------------------------------------------------------------------------
@@ -410,17 +410,24 @@ def _grade_number(answer: Any, question: Question) -> float:
 
 
 def _control(bench: Bench, rng: np.random.Generator) -> Made:
+    """Draw a target that is uniform in the outcome's range, so that no constant value is likely."""
     cause, outcome = _pair(bench, rng)
-    hidden = _inside(bench, cause, float(rng.choice([0.12, 0.88])))
     held, words = _held(bench, cause)
-    target = bench.means({**held, cause: hidden})[outcome]
-    places = [_inside(bench, cause, share) for share in (0.02, 0.5, 0.98)]
-    ends = [bench.means({**held, cause: place})[outcome] for place in places]
-    if np.ptp(ends) < 0.4 * bench.spread[outcome]:
+
+    def reached(share: float) -> float:
+        return bench.means({**held, cause: _inside(bench, cause, share)})[outcome]
+
+    if np.ptp([reached(share) for share in (0.02, 0.5, 0.98)]) < 0.4 * bench.spread[outcome]:
         raise Unusable(["the outcome hardly follows"])
+    shares, fine = np.linspace(0.02, 0.98, 13), np.linspace(0.02, 0.98, 1001)
+    found = np.array([reached(share) for share in shares])
+    inner = bench.inner(outcome, found)  # the same target at every level
+    wanted = inner.min() + rng.uniform(0.05, 0.95) * np.ptp(inner)
+    hidden = float(fine[np.argmin(np.abs(np.interp(fine, shares, inner) - wanted))])
+    target = reached(hidden)
     text = f"Which value of {cause} gives {outcome} the mean {target:.6g}{words}?"
     query = {"cause": cause, "outcome": outcome, "target": target, "held": held}
-    return Made(text, query, {cause: hidden}, 0.05 * float(np.ptp(ends)))
+    return Made(text, query, {cause: _inside(bench, cause, hidden)}, 0.03 * float(np.ptp(found)))
 
 
 def _grade_control(answer: Any, question: Question) -> float:
@@ -445,7 +452,8 @@ def _explanation(bench: Bench, rng: np.random.Generator) -> Made:
     _, outcome = _pair(bench, rng)
     usual, size = _usual(bench), bench.spread[outcome]
     for _ in range(8):
-        drawn = {name: _inside(bench, name, rng.uniform(0.05, 0.95)) for name in usual}
+        far = rng.uniform(0.2, 0.45)  # the same for all, so that distances tell nothing
+        drawn = {name: _inside(bench, name, 0.5 + far * rng.choice([-1, 1])) for name in usual}
         run, other = bench.unit(drawn)
         apart = {name: run[outcome] - other({name: usual[name]})[outcome] for name in usual}
         sign = max((1.0, -1.0), key=lambda sign: max(sign * one for one in apart.values()))
@@ -709,7 +717,7 @@ def question(
 
     Raises:
         UnknownOption: An argument does not exist.
-        ModelError: No draw of the seed can be certified.
+        Unusable: No draw of the seed can be certified.
     """
     from scm_world.lab.agents import certify
 
@@ -731,4 +739,4 @@ def question(
         rejected.append(
             f"the solver has {scores['solver']:.2f}, and a trivial answer {trivial:.2f}"
         )
-    raise ModelError([f"none of {DRAWS} draws of seed {seed} is a question: {rejected[-1]}"])
+    raise Unusable([f"none of {DRAWS} draws of seed {seed} is a question: {rejected[-1]}"])

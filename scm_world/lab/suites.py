@@ -23,7 +23,15 @@ from scm_world.discovery.data import Dataset, as_frame, as_huggingface, collect,
 from scm_world.discovery.problems import TaskView, problem
 from scm_world.errors import ModelError, ScmWorldError, UnknownOption, reading
 from scm_world.evaluation.statistics import mean_interval
-from scm_world.lab.questions import LEVELS, PASSED, Question, check_key, graph_pairs, question
+from scm_world.lab.questions import (
+    LEVELS,
+    PASSED,
+    Question,
+    Unusable,
+    check_key,
+    graph_pairs,
+    question,
+)
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
 from scm_world.runs.files import Location, is_there, located, read_bytes, write_whole
@@ -40,6 +48,8 @@ SUITES = ("lab-1", "physics-1")
 MANIFESTS = resources.files("scm_world.lab") / "manifests"
 ANSWER, CONFIDENCE, ID = "answer", "confidence", "question"
 """The columns of a file of answers."""
+SEEDS, NEXT = 5, 10_000
+"""How many seeds are tried where one has no question, and the distance of the next one."""
 ENDS = {"score": "value", "low": "low", "high": "high"}
 
 
@@ -82,7 +92,9 @@ class Made(NamedTuple):
     """What ``Suite.make`` wrote.
 
     Attributes:
-        parts: Of each part the number of its rows and its SHA-256, and of a table the true graph.
+        parts: Of each part the number of its rows and its SHA-256; of a table the true graph; of
+            questions their seeds, their draws, and how many seeds were skipped, as without a
+            question.
         differ: The parts whose content is not that of the manifest.
         versions: The versions that are not those of the manifest, such as ``"mujoco 3.3.0, here
             3.4.0"``.
@@ -258,7 +270,9 @@ def _here() -> dict[str, str]:
 
 def _recipe(recipe: Mapping[str, Any]) -> dict[str, Any]:
     """Return what decides a part, without what is known of it afterwards."""
-    return {name: one for name, one in recipe.items() if name not in ("sha256", "trivial")}
+    return {
+        name: one for name, one in recipe.items() if name not in ("sha256", "trivial", "skipped")
+    }
 
 
 def _ids(name: str, recipe: Mapping[str, Any]) -> list[str]:
@@ -364,22 +378,35 @@ def _questions(
     """Make the questions of a part; those without known draws are certified."""
     import pandas
 
-    secret, rows, draws = key if recipe.get("private") else None, [], []
+    secret, rows, made = key if recipe.get("private") else None, [], list[Question]()
     trivial: dict[str, float] = {}
     for number, (i, spec) in enumerate(zip(_ids(name, recipe), _specs(recipe), strict=True)):
         if "draws" in recipe:
-            one = Question.of({**spec, "draw": recipe["draws"][number]}, secret)
+            seed, draw = recipe["seeds"][number], recipe["draws"][number]
+            one = Question.of({**spec, "seed": seed, "draw": draw}, secret)
         else:
-            given = {n: spec[n] for n in ("kind", "world", "seed", "level")}
-            one = question(**given, key=secret, **spec["knobs"])
+            one = _certified(spec, secret)
             for answer, score in (one.certificate or {})["trivial"].items():
                 trivial[answer] = trivial.get(answer, 0.0) + score / recipe["n"]
-        draws.append(one.draw)
+        made.append(one)
         row = {ID: i, "kind": one.kind, "world": one.world, "level": one.level}
         row |= {"description": json.dumps(one.describe()), "spec": json.dumps(one.spec)}
         rows.append(row if secret else {**row, ANSWER: json.dumps(one.answer)})
-    about = {"draws": draws, "trivial": {n: round(s, 4) for n, s in trivial.items()}}
+    about: dict[str, Any] = {"seeds": [one.seed for one in made], "draws": [o.draw for o in made]}
+    about["skipped"] = sum((seed - recipe["seed"]) // NEXT for seed in about["seeds"])
+    about["trivial"] = {n: round(s, 4) for n, s in trivial.items()}
     return pandas.DataFrame(rows), about | ({"key": _mark(key)} if secret else {})
+
+
+def _certified(spec: Mapping[str, Any], secret: str | None) -> Question:
+    """Return the question of the first seed that has one; after s comes s + 10,000."""
+    seeds = range(spec["seed"], spec["seed"] + SEEDS * NEXT, NEXT)
+    for seed in seeds:
+        with suppress(Unusable):
+            return question(
+                spec["kind"], spec["world"], seed, spec["level"], secret, **spec["knobs"]
+            )
+    raise ModelError([f"no seed of {[*seeds]} has a question of {spec}"])
 
 
 def _specs(recipe: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -446,7 +473,8 @@ def _graded(
                 score: float | None = _overlap(answer, about)
             else:
                 number = int(i.rpartition("-")[2])
-                spec = {**specs[number], "draw": about["draws"][number]}
+                found = {"seed": about["seeds"][number], "draw": about["draws"][number]}
+                spec = {**specs[number], **found}
                 score = Question.of(spec, key if recipe.get("private") else None).grade(answer)
         except ScmWorldError:
             score = None

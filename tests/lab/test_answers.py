@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import mujoco
@@ -12,7 +13,7 @@ import pytest
 from scm_world import lab
 from scm_world.errors import ModelError
 from scm_world.lab.questions import Unusable, made
-from scm_world.lab.worlds import RIGS
+from scm_world.lab.worlds import RIGS, WORLDS, equations
 
 
 def drawn(kind: str, world: str, n: int, **knobs: Any) -> list[lab.Question]:
@@ -85,6 +86,37 @@ def test_laws_predictions_and_targets_of_linear_equations_follow_from_their_weig
     for do, mean in zip(asked.query["dos"], asked.answer, strict=True):
         moved = sum(row[names.index(name)] * (value - first[name]) for name, value in do.items())
         assert mean - asked.answer[0] == pytest.approx(moved, abs=1e-9)
+
+
+@pytest.mark.parametrize("law", ["plain", "dead zone"])
+def test_no_constant_answer_reaches_many_targets(law: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Targets are uniform in the outcome's range, also where a law is flat in the middle."""
+
+    def cheap(*given: Any) -> Any:
+        return replace(equations(*given), truth=200)
+
+    monkeypatch.setitem(WORLDS, "equations", (cheap, ""))  # type: ignore[index]
+    found = []
+    for asked in drawn("control", "equations", 35, law=law):
+        ((cause, _),) = asked.answer.items()
+        low, high = asked.bench.ends(cause)
+        shares = (0.0, 0.12, 0.3, 0.5, 0.7, 0.88, 1.0)
+        found.append([asked.grade({cause: low + share * (high - low)}) for share in shares])
+    again = lab.Question.of({**asked.spec, "level": "L4"})
+    inner = [again.bench.inner(*pair) for pair in again.answer.items()]
+    np.testing.assert_allclose(inner, [*asked.answer.values()], atol=0.002 * (high - low))
+    assert np.mean(found, axis=0).max() <= 0.25  # 0.13 are expected, of 35 questions
+
+
+def test_explanations_set_all_variables_at_the_same_distance() -> None:
+    """The one that is farthest from its usual value is not told by its number."""
+    for level in ("L2", "L4"):
+        (asked,) = drawn("explanation", "springs", 1)
+        asked = lab.Question.of({**asked.spec, "level": level})
+        q, ends = asked.query, asked.bench.ends
+        far = [abs(q["set"][n] - q["usual"][n]) / np.ptp(ends(n)) for n in q["set"]]
+        np.testing.assert_allclose(far, far[0], atol=1e-5)
+        assert far[0] >= 0.2
 
 
 def test_edges_of_equations_are_those_of_their_weights() -> None:

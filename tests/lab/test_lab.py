@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,9 @@ import pytest
 
 from scm_world import lab
 from scm_world.errors import ScmWorldError
+from scm_world.lab.agents import _confounded
 from scm_world.lab.expressions import evaluate
+from scm_world.lab.questions import made
 
 
 def test_a_question_is_answered_by_the_solver_and_by_no_trivial_answer() -> None:
@@ -153,12 +156,44 @@ def test_a_saved_run_is_repeated_to_the_bit_and_a_changed_one_is_found(
     assert lab.replay(path)[0].startswith("call 1")
 
 
+class Tools:
+    """The tools of a laboratory, and nothing else of it but what is left of the budget."""
+
+    def __init__(self, room: lab.Laboratory) -> None:
+        self._room = room
+
+    def __getattr__(self, name: str) -> Any:
+        assert name in ("describe", "observe", "experiment", "submit", "remaining"), name
+        return getattr(self._room, name)
+
+
+@pytest.mark.parametrize("kind", ["control", "prediction"])
+def test_the_random_agent_needs_the_tools_only(kind: str) -> None:
+    """Through other hands it does the same."""
+    asked = made(kind, "equations", 1, "L2", lab.Knobs(), 0, None)
+    room = lab.Laboratory(asked)
+    lab.AGENTS["random"](Tools(room))  # type: ignore[arg-type]
+    assert room.record() == lab.play("random", asked).record()
+    other = lab.play("random", made(kind, "equations", 2, "L2", lab.Knobs(), 0, None))
+    assert other.calls[1] != room.calls[1]
+
+
+def test_equal_residuals_share_a_cause() -> None:
+    """A correlation of one is no division by zero."""
+    same = np.random.default_rng(0).normal(size=40)
+    table = {"a": same, "b": -same, "c": np.random.default_rng(1).normal(size=40)}
+    room = SimpleNamespace(observe=lambda n: {"columns": table}, remaining=40)
+    with np.errstate(all="raise"):
+        found = _confounded(SimpleNamespace(room=room), [], dict.fromkeys(table, table))  # type: ignore[arg-type]
+    assert found == [["a", "b"]]
+
+
 def test_two_processes_make_the_same_questions_and_a_key_makes_others() -> None:
     """Digests cover the description and the answer."""
     program = (
-        "from scm_world import lab\n"
-        "print(lab.question('effect', 'equations', 5).digest)\n"
-        "print(lab.question('effect', 'equations', 5, key='a secret of a test').digest)\n"
+        "import scm_world as sw\n"
+        "print(sw.lab.question('effect', 'equations', 5).digest)\n"
+        "print(sw.lab.question('effect', 'equations', 5, key='a secret of a test').digest)\n"
     )
     runs = [
         subprocess.run(  # noqa: S603 # our own text

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,9 @@ from typer.testing import CliRunner
 
 from scm_world.cli.app import app
 from scm_world.discovery.data import load
-from scm_world.errors import UnknownOption, UnreadableFile
-from scm_world.lab import Question
+from scm_world.errors import ModelError, UnknownOption, UnreadableFile
+from scm_world.lab import Question, question
+from scm_world.lab.questions import Unusable
 from scm_world.lab.suites import SUITES, Suite, suite
 from scm_world.tasks.families import servo
 
@@ -109,6 +111,33 @@ def test_a_changed_row_is_named(tmp_path: Path) -> None:
         made.make(tmp_path / "s")
     (tmp_path / "s" / "effect-L2.json").unlink()
     assert made.make(tmp_path / "s") == found
+
+
+def test_a_seed_without_a_question_is_followed_by_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each time by the same one; the report says how many were skipped."""
+    monkeypatch.setattr("scm_world.lab.questions.DRAWS", 1)  # so that many seeds have none
+    recipe: dict[str, Any] = {**PARTS["effect-L2"], "seed": 3, "n": 3}
+    made = Suite("small-1", {**ABOUT, "parts": {"effect-L2": recipe}})
+    about = made.make(tmp_path / "s").parts["effect-L2"]
+    expected = []
+    for first in (3, 4, 5):
+        for seed in range(first, first + 50_000, 10_000):
+            with suppress(Unusable):
+                expected.append(question("effect", seed=seed))
+                break
+    assert about["seeds"] == [one.seed for one in expected]
+    assert about["skipped"] == sum(one.seed // 10_000 for one in expected) > 0
+    known = {**recipe, "seeds": about["seeds"], "draws": about["draws"]}
+    again = Suite("small-1", {**ABOUT, "parts": {"effect-L2": known}}).make(tmp_path / "again")
+    assert again.parts["effect-L2"]["sha256"] == about["sha256"]
+    right = pandas.read_parquet(tmp_path / "s" / "questions-effect-L2.parquet")
+    scored = made.score(right[["question", "answer"]], made=tmp_path / "s")
+    assert scored.score.tolist() == [1.0]
+    monkeypatch.setattr("scm_world.lab.suites.SEEDS", 1)
+    with pytest.raises(ModelError, match="no seed of"):
+        made.make(tmp_path / "none")
 
 
 def test_scores_are_those_of_a_count(folder: Path, tmp_path: Path) -> None:
