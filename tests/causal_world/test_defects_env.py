@@ -193,5 +193,6 @@ def test_d57_options_in_the_documents_exist() -> None:
             text = (ROOT / name).read_text()
             assert not [option for option in options if f'"{option}"' not in text]
         else:
-            known = {flag for option in commands.commands[name].params for flag in option.opts}
-            assert options <= known
+            command = commands.commands[name]
+            command = getattr(command, "commands", {}).get("".join(rest.split()[:1]), command)
+            assert options <= {flag for option in command.params for flag in option.opts}
