@@ -91,8 +91,8 @@ def converse(room: lab.Laboratory, ask: Callable[[list[Message]], Message], turn
 def main(given: Sequence[str] = ()) -> None:
     """Play one question, and print the score."""
     parser = argparse.ArgumentParser(description=__doc__)
-    for flag, default in (("kind", "effect"), ("world", "equations"), ("level", "L2")):
-        parser.add_argument(f"--{flag}", default=default)
+    for flag, default in (("--kind", "effect"), ("--world", "equations"), ("--level", "L2")):
+        parser.add_argument(flag, default=default)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--turns", type=int, default=60)
     for flag in ("--url", "--model", "--replay", "--out"):
