@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scm_world._arguments import typed, whole_number
 from scm_world._patterns import as_names
@@ -59,6 +60,7 @@ ROUGHLY = 5, 0.3, 3  # trials, deviation and steps where the model is wrong; see
 OPEN = 300.0  # scaled distance up to which an end is searched
 ALMOST = 0.01  # precision of the squares along a profile, in those at the end of an interval
 PROFILE = 8  # largest number of steps at the end of an interval
+MOVING = 0.1  # least share of what is known of a parameter in columns that move
 LINEAR = 0.1  # largest deviation from the squares that linearised residuals have there, relative
 
 
@@ -185,6 +187,7 @@ def fitted(minima: Minima, active: Sequence[int], first: Result | None = None) -
         active: Numbers of the parameters.
         first: The first minimum, if it was searched.
     """
+    problem = minima.problem
     best = first or minima.found(active)
     found = described(minima, active, best)
     about: dict[str, Any] = {"misfit": not found.explains or found.correlated}
@@ -200,21 +203,25 @@ def fitted(minima: Minima, active: Sequence[int], first: Result | None = None) -
         away = other[[*active]] - found.scaled
         margin = np.minimum(found.linear_reach, reach.max(axis=1))[:, None]
         reach = np.maximum(reach, np.array([-away, away]).T + margin)
-    if found.still and _usual(minima, best, active, found):
-        reach[:] = np.inf
+    still, each = found.still[problem.measured.cells[1]], found.sensitivities**2
+    shown = each[~still].sum(axis=0) >= MOVING * each.sum(axis=0)
+    if not shown.all() and _usual(minima, best, active, found, shown):
+        reach[~shown] = np.inf
     return dataclasses.replace(found, reach=reach, played=minima.played(best.at))
 
 
-def _usual(minima: Minima, best: Result, active: Sequence[int], found: Fit) -> bool:
-    """Return whether the defaults explain the recording as well as the fit, by the BIC.
+def _usual(
+    minima: Minima, best: Result, active: Sequence[int], found: Fit, shown: NDArray[np.bool_]
+) -> bool:
+    """Return whether defaults of what no motion shows explain as much as the fit, by the BIC.
 
     Two more parameters count for the oscillations of which a search finds the nearest in noise.
     """
-    scaled = best.at.scaled.copy()
-    scaled[[*active]] = 0.0
-    squares = LeastSquares(minima.problem, minima.problem.windows, best.noise, ())
+    scaled, others = best.at.scaled.copy(), np.array(active)[shown]
+    scaled[np.array(active)[~shown]] = 0.0
+    squares = LeastSquares(minima.problem, minima.problem.windows, best.noise, others.tolist())
     more = minima.search(squares, scaled, best.at.starts).squares.sum() - found.squares
-    penalty = (len(active) + 2) * np.log(len(found.residual))
+    penalty = (np.count_nonzero(~shown) + 2) * np.log(len(found.residual))
     return bool(more < penalty * found.discount)
 
 

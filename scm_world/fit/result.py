@@ -466,10 +466,10 @@ class Fit:
         return bool(np.mean(np.minimum(left / np.maximum(whole, 1e-300), 1.0)) > LEFT)
 
     @property
-    def _around(self) -> tuple[Floats, Floats, int]:
+    def _around(self) -> tuple[Floats, Floats, Integers]:
         """Squares of each column that the fit leaves, and that means do, (columns,).
 
-        The means are those of each column in each window; the third is how many there are.
+        The means are those of each column in each window; the third is how many each has.
         """
         (row, column), n = self.measured.cells, len(self.columns)
         values, where = self.measured.values[row, column], self._windows * n + column
@@ -479,22 +479,24 @@ class Fit:
             by_column(column, squares, n)[0]
             for squares in ((self.residual * self.noise[column]) ** 2, away)
         )
-        return left, whole, int((count > 0).sum())
+        means = np.bincount(np.flatnonzero(count) % n, minlength=n)
+        return left, whole, means
 
     @property
-    def still(self) -> bool:
-        """Whether a constant in each window explains the recording as well as the fit.
+    def still(self) -> NDArray[np.bool_]:
+        """Columns that a constant in each window explains as well as the fit, shape (columns,).
 
         Source:
             Schwarz, *Estimating the dimension of a model*, Annals of Statistics 1978: each
-            parameter more must reduce -2 log likelihood by the logarithm of the measurements.
+            parameter more must reduce -2 log likelihood by the logarithm of the measurements. The
+            fit has its parameters more, and a velocity at the start of each window.
         """
         left, whole, means = self._around
-        size, column = len(self.residual), self.measured.cells[1]
-        count = by_column(column, self.residual, len(self.columns))[1]
+        count = by_column(self.measured.cells[1], self.residual, len(self.columns))[1]
         least = count * self.measured.least**2
-        gain = (count * np.log(np.maximum(whole, least) / np.maximum(left, least))).sum()
-        return bool(gain < (size - self.degrees - means) * np.log(size))
+        gain = count * np.log(np.maximum(whole, least) / np.maximum(left, least))
+        more = len(self.scaled) + means
+        return np.asarray((count > 0) & (gain < more * np.log(np.maximum(count, 2.0))))
 
     @typed
     def predict(

@@ -251,6 +251,43 @@ def test_noise_of_what_hangs_still_determines_nothing() -> None:
     """A search finds an oscillation in it, which is no motion."""
     world = sw.World(ARM, control_dt=0.02)
     fit = world.fit(swung(50, 0.0, 7), ["lower.mass", "shoulder.frictionloss"])
-    assert fit.still
+    assert fit.still.all()
     assert not fit.table.determined.any()
     assert fit.table.low.isna().all()
+
+
+WHEEL = """
+<mujoco>
+  <option integrator="implicitfast"/>
+  <worldbody>
+    <body name="arm">
+      <joint name="swing" axis="0 1 0" damping="0.05"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="0.2"/>
+    </body>
+    <body name="wheel" pos="2 0 0">
+      <joint name="spin" axis="0 1 0" damping="0.5" frictionloss="0.1"/>
+      <geom type="cylinder" size="0.1 0.01" mass="0.1"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="motor" joint="swing" ctrlrange="-1 1"/></actuator>
+</mujoco>
+"""
+
+
+def test_a_joint_that_sticks_does_not_say_how_much() -> None:
+    """With little friction, start states fit its noise; what other joints show is determined."""
+    model, rng, found = mujoco.MjModel.from_xml_string(WHEEL), np.random.default_rng(0), []
+    data = mujoco.MjData(model)
+    commands = np.repeat(rng.uniform(-1.0, 1.0, 20), 5)
+    for data.ctrl[0] in commands:
+        found.append(data.qpos + 2e-3 * rng.normal(size=2))
+        mujoco.mj_step(model, data, 10)
+    measured = dict(zip(("swing.position", "spin.position"), np.array(found).T, strict=True))
+    recording = {"time": 0.02 * np.arange(100), "motor.control": commands, **measured}
+    names = ["spin.frictionloss", "spin.damping", "swing.damping"]
+    fit = sw.World(WHEEL, control_dt=0.02).fit(recording, names)
+    assert fit.still.tolist() == [column.name == "spin.position" for column in fit.columns]
+    table = fit.table.set_index("parameter")
+    assert table.low[names[:2]].isna().all()
+    assert table.determined["swing.damping"]
+    assert table.value["swing.damping"] == pytest.approx(0.05, rel=0.01)
