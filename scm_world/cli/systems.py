@@ -15,7 +15,6 @@ from scm_world._arguments import load, one_of
 from scm_world.cli import console, options
 from scm_world.cli.options import load_system, parse_assignments, parse_outcome, tag
 from scm_world.errors import EngineError, ScmWorldError, UnknownOption, UnreadableFile
-from scm_world.fit.recordings import LACKING
 from scm_world.runs.canvas import png
 from scm_world.runs.files import write_whole
 
@@ -502,6 +501,8 @@ def _setups(given: list[str], n: int) -> list[dict[str, object]]:
 
 def _predicted(found: sw.Fit, recording: str, names: dict[str, Any]) -> Any:
     """Predict a recording, which may lack renamed columns: those that were fitted have them."""
+    from scm_world.fit.recordings import LACKING
+
     try:
         return found.predict(recording, **names)
     except UnknownOption as error:
