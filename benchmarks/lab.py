@@ -29,7 +29,7 @@ from scm_world import lab
 from scm_world.discovery.data import load
 from scm_world.discovery.learners.registry import learn
 from scm_world.lab import suites
-from scm_world.lab.questions import Question, Unusable, made
+from scm_world.lab.questions import Question, Unusable, build
 from scm_world.runs.pool import Pool
 
 HERE = Path(__file__).parent
@@ -78,17 +78,17 @@ def stronger(question: Question) -> dict[str, Any]:
     query = question.query
     match question.kind:
         case "control":
-            ends = question.bench.ends(query["cause"])
+            ends = question.view.ends(query["cause"])
             place = {share: ends[0] + share * (ends[1] - ends[0]) for share in (0.12, 0.3, 0.88)}
             return {f"at {share:.0%}": {query["cause"]: x} for share, x in place.items()}
         case "explanation":
             usual = query["usual"]
-            width = {name: float(np.ptp(question.bench.ends(name))) for name in usual}
+            width = {name: float(np.ptp(question.view.ends(name))) for name in usual}
             far = {name: abs(query["set"][name] - usual[name]) / width[name] for name in usual}
             return {"farthest": max(far, key=lambda name: far[name])}
         case "graph":
-            names = [name for name, one in question.bench.quantities.items() if one.sets]
-            others = [name for name in question.bench.readable if name not in names] or names
+            names = [name for name, one in question.view.quantities.items() if one.sets]
+            others = [name for name in question.view.readable if name not in names] or names
             known = {tuple(edge) for edge in query["known"]}
             pairs = [[a, b] for a in names for b in others if a != b and (a, b) not in known]
             return {"all pairs": {"edges": pairs}, "half": {"edges": pairs[::2]}}
@@ -166,7 +166,7 @@ def names() -> dict[str, dict[str, dict[str, int]]]:
         for seed in range(1, 41):
             with suppress(Unusable):
                 if counts.total() < 16:
-                    counts[made(kind, world, seed, "L2", lab.Knobs(), 0, None).answer] += 1
+                    counts[build(kind, world, seed, "L2", lab.Knobs(), 0, None).answer] += 1
         found.setdefault(kind, {})[world] = dict(counts.most_common())
     return found
 

@@ -33,20 +33,20 @@ def confirm(question: Question) -> dict[str, Any]:
         return {"confirmed": None}
     own: Any = makers[question.world](question)
     query, answer = question.query, question.answer
-    names = {shown: one.name for shown, one in question.bench.quantities.items()}
+    names = {shown: one.name for shown, one in question.view.quantities.items()}
 
     def inner(values: Mapping[str, float]) -> dict[str, float]:
-        return {names[n]: float(question.bench.inner(n, v)) for n, v in values.items()}
+        return {names[n]: float(question.view.inner(n, v)) for n, v in values.items()}
 
     def apart(values: Any, right: float, units: int) -> float:
         """Return how far a mean is from the answer, in standard errors, or in its scale."""
-        shown = question.bench.shown(query["outcome"], np.asarray(values, float))
+        shown = question.view.shown(query["outcome"], np.asarray(values, float))
         if own.exact or np.ptp(shown) == 0.0:
             return float(abs(shown.mean() - right) / (CLOSE * question.scale))
         error = shown.std() * np.sqrt(1.0 / units + 1.0 / shown.size)
         return float(abs(shown.mean() - right) / (ERRORS * error))
 
-    made, outcome = question.bench.apparatus, names.get(query.get("outcome", ""), "")
+    made, outcome = question.view.testbed, names.get(query.get("outcome", ""), "")
     match question.kind:
         case "graph":
             edges, hidden = own.graph()
@@ -56,7 +56,7 @@ def confirm(question: Question) -> dict[str, Any]:
         case "effect":
             ends = [inner({query["cause"]: query[end]}) for end in ("to", "from")]
             one, other = (own.units(do)[outcome] for do in ends)
-            scale = question.bench._affine[query["outcome"]][0]
+            scale = question.view._affine[query["outcome"]][0]
             change = scale * (one - other)
             error = change.std() * np.sqrt(1.0 / made.truth + 1.0 / change.size)
             far = abs(change.mean() - answer) / max(ERRORS * error, CLOSE * abs(answer))
@@ -72,20 +72,20 @@ def confirm(question: Question) -> dict[str, Any]:
             far = apart(own.units(do)[outcome], query["target"], made.truth)
         case "counterfactual":
             value = own.other(inner(query["run"]), inner({query["cause"]: query["value"]}))
-            shown = question.bench.shown(query["outcome"], value[outcome])
+            shown = question.view.shown(query["outcome"], value[outcome])
             far = abs(shown - answer) / (own.close * question.scale)
         case "explanation":
             bad = []
             for name in query["usual"]:
                 do = inner({**query["set"], name: query["usual"][name]})
-                end = question.bench.shown(query["outcome"], own.units(do)[outcome][0])
+                end = question.view.shown(query["outcome"], own.units(do)[outcome][0])
                 sign = 1.0 if query["fails"] == "above" else -1.0
                 bad += [name] if sign * (end - query["limit"]) <= 0.0 else []
             return {"confirmed": bad == [answer]}
         case _:
             run, least = inner(query["run"]), dict[str, float]()
             for name in query["usual"]:
-                low, high = question.bench.ends(name)
+                low, high = question.view.ends(name)
                 least[name] = np.inf
                 for share in (0.08, 0.92):
                     value = round(low + share * (high - low), 6)
@@ -103,7 +103,7 @@ class Equations:
     exact, close = False, 1e-6
 
     def __init__(self, question: Question) -> None:
-        made: Any = question.bench.apparatus
+        made: Any = question.view.testbed
         model, self.read = made.world, made.quantities
         self.laws: dict[str, Any] = {}
         self.noise: dict[str, float] = {}
@@ -173,7 +173,7 @@ class Rig:
     exact = False
 
     def __init__(self, question: Question) -> None:
-        made: Any = question.bench.apparatus
+        made: Any = question.view.testbed
         self.task, self.quantities = made.world.task, made.quantities
         self.model = mujoco.MjModel.from_xml_string(self.task.given["model"])
         self.causes = [one for one in made.quantities if one.sets and "." in one.name]
@@ -242,7 +242,7 @@ class Network:
     exact, close = True, CLOSE
 
     def __init__(self, question: Question) -> None:
-        made: Any = question.bench.apparatus
+        made: Any = question.view.testbed
         task = made.world.task
         self.model = mujoco.MjModel.from_xml_string(task.given["model"])
 
@@ -271,7 +271,7 @@ class Servo:
     exact, close = False, 0.05
 
     def __init__(self, question: Question) -> None:
-        made: Any = question.bench.apparatus
+        made: Any = question.view.testbed
         self.task, self.steps = made.world.task, made.setting["steps"]
         self.model = mujoco.MjModel.from_xml_string(self.task.given["model"])
         self.arms = {one.name: one for one in made.quantities}

@@ -22,7 +22,7 @@ Key = Annotated[str | None, typer.Option(envvar="SCM_LAB_KEY")]
 
 
 @dataclass
-class Asked:
+class QuestionOptions:
     """The options of a question.
 
     Args:
@@ -64,7 +64,7 @@ def list_() -> None:
     console.frame(rows, title="questions; a model file is a world, too")
 
 
-def question(asked: Asked) -> None:
+def question(asked: QuestionOptions) -> None:
     """Show a certified question, without its answer.
 
     Example: scm-world lab question --kind effect --world springs --seed 3 --level L2
@@ -74,7 +74,7 @@ def question(asked: Asked) -> None:
     typer.echo(json.dumps(shown, indent=1, ensure_ascii=False))
 
 
-def run(asked: Asked, *, agent: str = "random", out: options.Text = None) -> None:
+def run(asked: QuestionOptions, *, agent: str = "random", out: options.Text = None) -> None:
     """Let a scripted agent answer a question, and print its score.
 
     Example: scm-world lab run --kind effect --world springs --seed 3 --agent random
@@ -88,7 +88,7 @@ def run(asked: Asked, *, agent: str = "random", out: options.Text = None) -> Non
     _finish(lab.play(agent, asked.question()), out)
 
 
-def play(asked: Asked, *, out: options.Text = None) -> None:
+def play(asked: QuestionOptions, *, out: options.Text = None) -> None:
     """Answer a question by hand: type a tool and its arguments as JSON.
 
     Example: scm-world lab play --kind effect --world springs
@@ -143,7 +143,7 @@ def serve(
     level: str = "L2",
     n: options.N = 1,
     seed: options.NotNegative = 0,
-    key: Annotated[str | None, typer.Option(envvar="SCM_LAB_KEY")] = None,
+    key: Key = None,
     out: options.Text = None,
     mcp: bool = False,
     http: bool = False,
@@ -198,7 +198,7 @@ def serve(
         serving.http(rooms, token or ""), host=host, port=port, log_level="warning"
     )
     bound, address = bind(config)
-    bound.listen()  # a client that is told at once waits until the server answers
+    bound.listen()  # a client that connects at once waits until the server answers
     console.say(f"{address}/mcp")
     with suppress(KeyboardInterrupt):
         uvicorn.Server(config).run(sockets=[bound])

@@ -221,7 +221,7 @@ class _Termed(Simulator):
 
 
 @final
-class _Diagnosing:
+class Diagnosing:
     """Tries terms on a fit.
 
     Args:
@@ -545,8 +545,3 @@ def _moved(begin: Fit, world: World, usual: Floats, free: Integers) -> tuple[Flo
         if same is not None:
             starts[:, where], spans[where] = begin.starts[:, same], sizes[same]
     return starts, spans[free]
-
-
-def diagnosed(fit: Fit, progress: Progress | None = None) -> Diagnosis:
-    """Try standard terms on a fit; see ``Fit.diagnose``."""
-    return _Diagnosing(fit, progress).run()

@@ -90,12 +90,12 @@ def fit(
     count, number = len(measured.cells[0]), len(targets)
     known = measured.given(noise)
     usual = (WINDOW, SHORT, WINDOW) if window is None else (window,)
-    searched, outliers, told = dict[int, Result](), list[Outlier](), itertools.count(1)
+    searched, outliers, reports = dict[int, Result](), list[Outlier](), itertools.count(1)
     planned = SEARCHED + 2 * number
 
     def tell() -> None:
         if progress is not None:
-            done = next(told)
+            done = next(reports)
             progress(done, max(planned, done + 1))
 
     for attempt, rows in enumerate(usual, 1):
@@ -137,7 +137,7 @@ def fit(
                 found = dataclasses.replace(found, interrupted=True)
                 break
     if progress is not None:
-        done = next(told)
+        done = next(reports)
         progress(done, done)
     more = "" if found.explains or found.interrupted else reading_of(world, measured)
     about: dict[str, Any] = {"later": later, "outliers": tuple(outliers), "reading": more}

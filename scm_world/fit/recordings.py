@@ -143,7 +143,7 @@ class RecordedRun:
         return sent[np.clip(steps + len(before), 0, len(sent) - 1)]
 
     def acting(self, delays: Floats, steps: Integers, substeps: int) -> Floats:
-        """Return the mean command of each physics step where commands are ``sent`` within them.
+        """Return the mean command of each physics step, of commands that were ``sent`` within them.
 
         Before the first command, this one is assumed to hold.
 

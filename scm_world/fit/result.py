@@ -15,7 +15,7 @@ from scm_world._arguments import typed, whole_number
 from scm_world._types import Floats, Integers
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.fit.design import PROBES, Experiment, suggested, unseen
-from scm_world.fit.diagnosis import Diagnosis, diagnosed
+from scm_world.fit.diagnosis import Diagnosing, Diagnosis
 from scm_world.fit.prediction import Prediction, predicted
 from scm_world.fit.problem import (
     SHORT,
@@ -555,7 +555,7 @@ class Fit:
         Args:
             progress: Called after each term. After Ctrl-C, the terms that were tried are returned.
         """
-        return diagnosed(self, progress)
+        return Diagnosing(self, progress).run()
 
     @typed
     def save(self, path: str | Path) -> None:

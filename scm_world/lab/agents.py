@@ -13,7 +13,7 @@ import numpy as np
 from scm_world._arguments import one_of
 from scm_world._types import Floats
 from scm_world.lab.expressions import evaluate
-from scm_world.lab.laboratory import Laboratory
+from scm_world.lab.laboratory import ROWS, Laboratory
 from scm_world.lab.questions import Question
 
 Columns = Mapping[str, Floats]
@@ -25,7 +25,7 @@ def _columns(result: Mapping[str, Any]) -> dict[str, Floats]:
 
 def _experiment(room: Laboratory, do: Mapping[str, Any], n: int) -> dict[str, Floats]:
     """Run an experiment in calls of a size that is allowed."""
-    parts = [min(200, n - begin) for begin in range(0, n, 200)]
+    parts = [min(ROWS, n - begin) for begin in range(0, n, ROWS)]
     found = [
         _columns(room.experiment(dict(do), n=part) if do else room.observe(part)) for part in parts
     ]
@@ -172,7 +172,6 @@ def _solve_law(known: _Known) -> Any:
 
 
 def _solve_prediction(known: _Known) -> Any:
-    table = None
     outcomes = [n for n in known.readable if n not in known.ends]
     if outcomes:
         table = _experiment(known.room, known.ends, known.budget)
@@ -226,7 +225,7 @@ def _solve_diagnosis(known: _Known) -> Any:
         return np.array([table[o].mean() for o in outcomes])
 
     usual = readings(q["usual"], 2 * n)
-    run, size, errors = np.array([q["run"][o] for o in outcomes]), {}, {}
+    run, errors = np.array([q["run"][o] for o in outcomes]), dict[str, float]()
     places: dict[str, list[Floats]] = {}
     for name, (low, high) in known.ends.items():
         shares = (0.08, 0.3, 0.7, 0.92)
@@ -326,14 +325,14 @@ def certify(question: Question) -> dict[str, Any]:
 def guess(room: Laboratory) -> None:
     """Set one variable at random, five times, and answer at random."""
     known = _Known(room)
-    told = hashlib.sha256(json.dumps(known.about, sort_keys=True).encode()).digest()
-    rng = np.random.default_rng(int.from_bytes(told[:8]))
+    seed = hashlib.sha256(json.dumps(known.about, sort_keys=True).encode()).digest()
+    rng = np.random.default_rng(int.from_bytes(seed[:8]))
     for _ in range(5):
         name = str(rng.choice([*known.ends]))
         room.experiment({name: float(rng.uniform(*known.ends[name]))})
     if known.query is None:  # it is asked when the budget is spent
         while room.remaining:
-            room.observe(min(200, room.remaining))
+            room.observe(min(ROWS, room.remaining))
     q = room.describe()["query"]
     name = str(rng.choice([*known.ends]))
     edges = [[a, b] for a in known.ends for b in known.readable if a != b and rng.random() < 0.3]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scm_world._arguments import one_of, typed, whole_number
 from scm_world._types import Floats
 from scm_world.errors import Forbidden, UnknownOption
-from scm_world.lab.laboratory import Laboratory
+from scm_world.lab.laboratory import ROWS, Laboratory
 from scm_world.lab.questions import Question, question
 
 LEAVE, LOW, HIGH, RANDOM = range(4)
@@ -71,7 +71,7 @@ class LabEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.int64]]):
         self.seeds = whole_number("seeds", seeds, least=1)
         first = whole_number("first", first, least=0)
         self.experiments = whole_number("experiments", experiments, least=1)
-        self.n = whole_number("n", n, least=1, most=200)
+        self.n = whole_number("n", n, least=1, most=ROWS)
         self.questions = _questions(kind, world, level, first, self.seeds)
         if self.experiments * self.n > (budget := self.questions[0].budget):
             raise UnknownOption("experiments", experiments, (f"at most {budget // n} of {n}",))

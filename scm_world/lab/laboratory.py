@@ -20,7 +20,7 @@ from scm_world.runs.files import read_text, write_whole
 FORMAT = "scm_world/lab/1"
 TOOLS = ("describe", "observe", "experiment", "note", "submit")
 NOTES, LONGEST = 1000, 2000
-"""How many notes and refused calls a run keeps, and characters of a note or an answer."""
+"""How many notes a run keeps, and characters of a note."""
 ROWS = 200
 """The most episodes of one call."""
 
@@ -44,7 +44,7 @@ class Laboratory:
     def __init__(self, question: Question) -> None:
         if not isinstance(question, Question):
             raise UnknownOption("question", question, ("a Question, as lab.question returns it",))
-        self.question, self._bench = question, question.bench.fresh()
+        self.question, self._view = question, question.view.fresh()
         self.spent, self.calls = 0, list[dict[str, Any]]()
         self.score: dict[str, float] | None = None
         self._lock = threading.RLock()
@@ -126,14 +126,14 @@ class Laboratory:
         return found
 
     def _settings(self, do: Any) -> dict[str, Any]:
-        bench = self._bench
-        settable = {name for name, one in bench.quantities.items() if one.sets}
+        view = self._view
+        settable = {name for name, one in view.quantities.items() if one.sets}
         if not isinstance(do, Mapping) or not do:
             raise UnknownOption("do", do, ("values by name", *sorted(settable)))
         found = {}
         for name, value in do.items():
             one_of("variable to set", name, sorted(settable))
-            low, high = bench.ends(name)
+            low, high = view.ends(name)
             many = value if isinstance(value, list | tuple) else [value]
             if not 1 <= len(many) <= 2:
                 raise UnknownOption(f"value of {name}", value, ("a number", "a pair of numbers"))
@@ -148,16 +148,16 @@ class Laboratory:
 
     def _run(self, do: dict[str, Any], at: Any, n: Any) -> dict[str, Any]:
         n = whole_number("n", n, least=1, most=ROWS)
-        steps = self._bench.apparatus.setting.get("steps", 1)
+        steps = self._view.testbed.setting.get("steps", 1)
         at = whole_number("at", at, least=0, most=steps - 1)
         if n > self.remaining:
             raise Forbidden(f"run {n} more episodes", (f"{self.remaining} episodes",))
-        table, _ = self._bench.run(do, n, at)
+        table = self._view.run(do, n, at)
         self.spent += n
         keep = [*range(n)]
-        if self._bench.knobs.selection and not do:
-            name = self._bench.readable[0]
-            keep = [i for i in keep if table[name][i] > self._bench.middle[name]]
+        if self._view.knobs.selection and not do:
+            name = self._view.readable[0]
+            keep = [i for i in keep if table[name][i] > self._view.middle[name]]
         columns = {name: [float(column[i]) for i in keep] for name, column in table.items()}
         return {"columns": columns, "remaining": self.remaining}
 
@@ -175,7 +175,7 @@ class Laboratory:
             "score": grade,
             "budget": self.spent / self.question.budget,
             "confidence": sure,
-            "brier": (sure - float(grade >= PASSED)) ** 2,
+            "brier": brier(sure, grade),
         }
         return dict(self.score)
 
@@ -183,7 +183,7 @@ class Laboratory:
 
     def record(self) -> dict[str, Any]:
         """Return the run as plain data: question, calls with results, score and versions."""
-        engine = getattr(self.question.bench.apparatus.world, "engine", "")
+        engine = getattr(self.question.view.testbed.world, "engine", "")
         return {
             "format": FORMAT,
             "question": self.question.spec,
@@ -210,6 +210,16 @@ def _plain(arguments: Mapping[str, Any]) -> Any:
     if len(text) > 4 * LONGEST:
         raise UnknownOption("arguments", text[:40], (f"at most {4 * LONGEST} characters",))
     return json.loads(text)
+
+
+def brier(confidence: float, grade: float) -> float:
+    """Return the squared error of a confidence that an answer is right.
+
+    Source:
+        Brier, *Verification of forecasts expressed in terms of probability*, Monthly Weather Review
+        1950.
+    """
+    return float((confidence - float(grade >= PASSED)) ** 2)
 
 
 def tools() -> list[dict[str, Any]]:
@@ -244,6 +254,11 @@ def replay(path: str | PathLike[str], key: str | None = None) -> list[str]:
     Raises:
         UnreadableFile: It is not such a file.
     """
+    return repeated(path, key)[1]
+
+
+def repeated(path: str | PathLike[str], key: str | None = None) -> tuple[Laboratory, list[str]]:
+    """Repeat a saved run; return its laboratory after the last call, and what differs."""
     with reading(path, "give a file that Laboratory.save or scm-world lab run wrote"):
         run = json.loads(read_text(str(path)))
         if run["format"] != FORMAT:
@@ -260,7 +275,7 @@ def replay(path: str | PathLike[str], key: str | None = None) -> list[str]:
         found.append("the score")
     if found and run.get("versions") != room.record()["versions"]:
         found.append(f"versions: {run.get('versions')} then, {room.record()['versions']} now")
-    return found
+    return room, found
 
 
 @typed

@@ -14,9 +14,8 @@ from typing import Any, final
 
 from scm_world._arguments import load, one_of
 from scm_world.errors import ScmWorldError, UnknownOption, UnreadableFile
-from scm_world.lab.laboratory import Laboratory, tools
-from scm_world.lab.questions import Question, question
-from scm_world.runs.files import read_text
+from scm_world.lab.laboratory import Laboratory, repeated, tools
+from scm_world.lab.questions import question
 
 LARGEST = 1 << 20
 """The most bytes of a request."""
@@ -76,12 +75,9 @@ class Laboratories:
         path = None if self._out is None else self._out / f"{name}.json"
         if path is None or not path.exists():
             return Laboratory(question(**self._asked[name], key=self._key))
-        run = json.loads(read_text(path))
-        room = Laboratory(Question.of(run["question"], self._key))
-        for one in run["calls"]:
-            room.call(one["tool"], one["arguments"])
-        if room.calls != run["calls"] or room.question.digest != run["digest"]:
-            why = "its calls give other results now"
+        room, differ = repeated(path, self._key)
+        if differ:
+            why = f"its calls give other results now: {', '.join(differ)}"
             raise UnreadableFile(str(path), why, "choose another folder for the runs")
         return room
 

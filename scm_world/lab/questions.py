@@ -17,7 +17,7 @@ from scm_world._types import Floats
 from scm_world.discovery.metrics import evaluate as evaluate_graph
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.lab.expressions import FORM, evaluate
-from scm_world.lab.worlds import RIGS, WORLDS, Apparatus, Knobs, apparatus
+from scm_world.lab.worlds import RIGS, WORLDS, Knobs, Testbed, testbed
 from scm_world.queries import Laboratory
 from scm_world.variables import Box, Draw, Hard
 
@@ -31,8 +31,6 @@ PASSED, FAILED = 0.95, 0.2
 """A solver has at least the first score, and no trivial answer more than the second one."""
 DRAWS, PILOT = 40, 40
 """How many draws of a seed are tried, and units whose spread is that of a reading."""
-
-
 SHORTEST = 16
 """The fewest characters of a key."""
 
@@ -45,26 +43,26 @@ class Unusable(ModelError):
 
 
 @final
-class Bench:
-    """An apparatus under the names and scales of a level, with noise of its readings.
+class LevelView:
+    """An testbed under the names and scales of a level, with noise of its readings.
 
     Args:
-        apparatus: What can be set and read.
+        testbed: What can be set and read.
         level: A name of ``LEVELS``.
         knobs: Noise and selection.
         entropy: What all random numbers follow from.
     """
 
-    def __init__(self, apparatus: Apparatus, level: str, knobs: Knobs, entropy: int) -> None:
-        self.apparatus, self.level, self.knobs, self.entropy = apparatus, level, knobs, entropy
+    def __init__(self, testbed: Testbed, level: str, knobs: Knobs, entropy: int) -> None:
+        self.testbed, self.level, self.knobs, self.entropy = testbed, level, knobs, entropy
         rng = np.random.default_rng([entropy, 1])
-        n, masked = len(apparatus.quantities), level in ("L3", "L4")
+        n, masked = len(testbed.quantities), level in ("L3", "L4")
         order = rng.permutation(n) if level == "L4" else np.arange(n)
         scale, shift = np.ones(n), np.zeros(n)
         if level == "L4":
             scale, shift = rng.uniform(0.3, 3.0, n) * rng.choice([-1.0, 1.0], n), rng.normal(size=n)
         self.quantities = {
-            f"v{place + 1}" if masked else apparatus.quantities[i].name: apparatus.quantities[i]
+            f"v{place + 1}" if masked else testbed.quantities[i].name: testbed.quantities[i]
             for place, i in enumerate(order)
         }
         self.names = {one.name: shown for shown, one in self.quantities.items()}
@@ -83,16 +81,16 @@ class Bench:
         """Return the world with units of its own: those of answers, or those of an agent."""
         if is_truth not in self._worlds:
             self._worlds[is_truth] = Laboratory(
-                self.apparatus.world,
+                self.testbed.world,
                 outcomes=[self.quantities[name].reads for name in self.readable],
                 seed=(self.entropy + is_truth) % 2**62,
-                **self.apparatus.setting,
+                **self.testbed.setting,
             )
         return self._worlds[is_truth]
 
-    def fresh(self) -> Bench:
-        """Return this bench with no unit used."""
-        other = object.__new__(Bench)
+    def fresh(self) -> LevelView:
+        """Return the same with no unit used."""
+        other = object.__new__(LevelView)
         vars(other).update(vars(self), _worlds={})
         return other
 
@@ -134,12 +132,12 @@ class Bench:
 
     # --- experiments ----------------------------------------------------------------------------
 
-    def run(self, do: Mapping[str, Any], n: int, at: int = 0) -> tuple[dict[str, Floats], int]:
-        """Run episodes of the agent; return noisy readings, and the number of the first one."""
+    def run(self, do: Mapping[str, Any], n: int, at: int = 0) -> dict[str, Floats]:
+        """Run episodes of the agent; return noisy readings."""
         room = self._room(False)
         first = room.spent
         samples = room.do(self.plan(do, at), n) if do else room.see(n)
-        return self.noisy(self._table(samples), first), first
+        return self.noisy(self._table(samples), first)
 
     def noisy(self, table: dict[str, Floats], first: int) -> dict[str, Floats]:
         """Add the noise of readings; that of an episode depends on its number only."""
@@ -159,24 +157,24 @@ class Bench:
 
     def means(self, do: Mapping[str, Any]) -> dict[str, float]:
         """Return the mean of each reading under an intervention, over held-out units."""
-        world, setting = self.apparatus.world, self.apparatus.setting
+        world, setting = self.testbed.world, self.testbed.setting
         wanted = [self.quantities[name].reads for name in self.readable]
         seed = (self.entropy + 2) % 2**62
         fixed = {n for n, one in self.quantities.items() if one.sets} <= {*do}
-        n = 1 if fixed and self.apparatus.independent else self.apparatus.truth
+        n = 1 if fixed and self.testbed.independent else self.testbed.truth
         found = world.sample(n, self.plan(do), outcomes=wanted, seed=seed, **setting)
         return {name: float(column.mean()) for name, column in self._table(found).items()}
 
     def effect(self, outcome: str, cause: str, ends: Sequence[float]) -> Any:
         """Return the average effect of a change of a cause, on the scale of the level."""
         scale, _ = self._affine[outcome]
-        found = self.apparatus.world.effect(
+        found = self.testbed.world.effect(
             self.quantities[outcome].reads,
             do=self.plan({cause: ends[1]}),
             versus=self.plan({cause: ends[0]}),
-            n=self.apparatus.truth,
+            n=self.testbed.truth,
             seed=(self.entropy + 2) % 2**62,
-            **self.apparatus.setting,
+            **self.testbed.setting,
         )
         return scale * float(found.mean)
 
@@ -198,7 +196,7 @@ class Bench:
 # --- kinds ----------------------------------------------------------------------------------------
 
 
-class Made(NamedTuple):
+class Query(NamedTuple):
     """A query as the agent gets it, its answer, and what grades need."""
 
     text: str
@@ -215,13 +213,12 @@ class Kind(NamedTuple):
         form: The form of an answer.
         make: Draws a query.
         grade: Returns the score of an answer, in [0, 1].
-        hides: Whether observations are confounded by a variable that is not shown.
         late: Whether the query is shown only when the budget is spent.
     """
 
     doc: str
     form: str
-    make: Callable[[Bench, np.random.Generator], Made]
+    make: Callable[[LevelView, np.random.Generator], Query]
     grade: Callable[[Any, Question], float]
     late: bool = False
 
@@ -231,9 +228,9 @@ def near(error: float, scale: float) -> float:
     return float(np.clip(1.5 - 0.5 * error / scale, 0.0, 1.0))
 
 
-def _pair(bench: Bench, rng: np.random.Generator) -> tuple[str, str]:
+def _pair(view: LevelView, rng: np.random.Generator) -> tuple[str, str]:
     """Draw a settable cause, and an outcome that descends from it; confounded pairs, if any."""
-    made = bench.apparatus
+    made = view.testbed
     graph, outcomes = nx.DiGraph([*made.edges, *made.own]), {one.name for one in made.outcomes}
     unseen = [(f"hidden {i}", name) for i, pair in enumerate(made.confounded) for name in pair]
     every = nx.DiGraph([*graph.edges, *unseen])
@@ -253,27 +250,27 @@ def _pair(bench: Bench, rng: np.random.Generator) -> tuple[str, str]:
 
     pairs = [pair for pair in pairs if confounded(*pair)] or pairs
     cause, outcome = pairs[int(rng.integers(len(pairs)))]
-    return bench.names[cause], bench.names[outcome]
+    return view.names[cause], view.names[outcome]
 
 
-def _inside(bench: Bench, name: str, share: float) -> float:
-    one = bench.quantities[name]
-    return round(float(bench.shown(name, one.low + share * (one.high - one.low))), 6)
+def _inside(view: LevelView, name: str, share: float) -> float:
+    one = view.quantities[name]
+    return round(float(view.shown(name, one.low + share * (one.high - one.low))), 6)
 
 
-def _graph(bench: Bench, rng: np.random.Generator) -> Made:
-    made, shown = bench.apparatus, bench.names
+def _graph(view: LevelView, rng: np.random.Generator) -> Query:
+    made, shown = view.testbed, view.names
     edges = sorted([shown[c], shown[e]] for c, e in made.edges)
     hidden = sorted(sorted((shown[a], shown[b])) for a, b in made.confounded)
     own = sorted([shown[c], shown[e]] for c, e in made.own)
     if not edges:
         raise Unusable(["no edge"])
     text = "Which variables act directly on which, and which pairs have a hidden common cause?"
-    return Made(text, {"known": own}, {"edges": edges, "hidden": hidden})
+    return Query(text, {"known": own}, {"edges": edges, "hidden": hidden})
 
 
 def _grade_graph(answer: Any, question: Question) -> float:
-    names, truth = list(question.bench.quantities), question.answer
+    names, truth = list(question.view.quantities), question.answer
     given = graph_pairs(answer, "edges", names), graph_pairs(answer, "hidden", names)
     own = {tuple(edge) for edge in question.query["known"]}
     edges = [(c, e, 0) for c, e in given[0] if (c, e) not in own]
@@ -298,17 +295,17 @@ def graph_pairs(answer: Any, part: str, names: Sequence[str]) -> list[tuple[str,
     return [(str(a), str(b)) for a, b in found if a != b]
 
 
-def _effect(bench: Bench, rng: np.random.Generator) -> Made:
-    cause, outcome = _pair(bench, rng)
-    ends = [_inside(bench, cause, share) for share in (0.2, 0.8)]
-    answer = bench.effect(outcome, cause, ends)
-    if abs(answer) < 0.3 * bench.spread[outcome]:
+def _effect(view: LevelView, rng: np.random.Generator) -> Query:
+    cause, outcome = _pair(view, rng)
+    ends = [_inside(view, cause, share) for share in (0.2, 0.8)]
+    answer = view.effect(outcome, cause, ends)
+    if abs(answer) < 0.3 * view.spread[outcome]:
         raise Unusable(["the effect is within the noise"])
     text = (
         f"By how much does the mean of {outcome} change if {cause} is set to {ends[1]:g} "
         f"instead of {ends[0]:g}?"
     )
-    return Made(
+    return Query(
         text,
         {"cause": cause, "outcome": outcome, "from": ends[0], "to": ends[1]},
         answer,
@@ -316,28 +313,28 @@ def _effect(bench: Bench, rng: np.random.Generator) -> Made:
     )
 
 
-def _held(bench: Bench, cause: str) -> tuple[dict[str, float], str]:
+def _held(view: LevelView, cause: str) -> tuple[dict[str, float], str]:
     """Return what a question about one cause holds: all others, if none acts on another."""
-    if not bench.apparatus.independent:
+    if not view.testbed.independent:
         return {}, ""
     return {
-        n: v for n, v in _usual(bench).items() if n != cause
+        n: v for n, v in _usual(view).items() if n != cause
     }, ", all others at their usual value"
 
 
-def _law(bench: Bench, rng: np.random.Generator) -> Made:
-    cause, outcome = _pair(bench, rng)
-    held, words = _held(bench, cause)
-    places = [_inside(bench, cause, share) for share in np.linspace(0.03, 0.97, 13)]
-    found = [bench.means({**held, cause: place})[outcome] for place in places]
-    if np.std(found) < 0.2 * bench.spread[outcome]:
+def _law(view: LevelView, rng: np.random.Generator) -> Query:
+    cause, outcome = _pair(view, rng)
+    held, words = _held(view, cause)
+    places = [_inside(view, cause, share) for share in np.linspace(0.03, 0.97, 13)]
+    found = [view.means({**held, cause: place})[outcome] for place in places]
+    if np.std(found) < 0.2 * view.spread[outcome]:
         raise Unusable(["the law is within the noise"])
     text = (
         f"How does the mean of {outcome} depend on {cause}, if {cause} is set{words}? An "
         f"expression in {cause}, for {places[0]:g} to {places[-1]:g}."
     )
     query = {"cause": cause, "outcome": outcome, "held": held}
-    return Made(text, query, {"values": places, "means": found}, 0.12 * float(np.std(found)))
+    return Query(text, query, {"values": places, "means": found}, 0.12 * float(np.std(found)))
 
 
 def _grade_law(answer: Any, question: Question) -> float:
@@ -350,23 +347,23 @@ def _grade_law(answer: Any, question: Question) -> float:
     return near(error, question.scale) if np.isfinite(error) else 0.0
 
 
-def _prediction(bench: Bench, rng: np.random.Generator) -> Made:
-    _, outcome = _pair(bench, rng)
-    causes = [name for name in _usual(bench) if name != outcome]
-    dos = [{n: _inside(bench, n, rng.uniform(0.1, 0.9)) for n in causes} for _ in range(4)]
-    found = [bench.means(do)[outcome] for do in dos]
-    everything = {name: bench.ends(name) for name in causes}
-    spread = bench.apparatus.world.sample(
+def _prediction(view: LevelView, rng: np.random.Generator) -> Query:
+    _, outcome = _pair(view, rng)
+    causes = [name for name in _usual(view) if name != outcome]
+    dos = [{n: _inside(view, n, rng.uniform(0.1, 0.9)) for n in causes} for _ in range(4)]
+    found = [view.means(do)[outcome] for do in dos]
+    everything = {name: view.ends(name) for name in causes}
+    spread = view.testbed.world.sample(
         40,
-        bench.plan(everything),
-        outcomes=[bench.quantities[outcome].reads],
-        seed=(bench.entropy + 2) % 2**62,
-        **bench.apparatus.setting,
+        view.plan(everything),
+        outcomes=[view.quantities[outcome].reads],
+        seed=(view.entropy + 2) % 2**62,
+        **view.testbed.setting,
     )
-    size = abs(bench._affine[outcome][0]) * float(np.std(next(iter(spread.values()))))
+    size = abs(view._affine[outcome][0]) * float(np.std(next(iter(spread.values()))))
     if np.ptp(found) < 0.8 * size:
         raise Unusable(["all answers are alike"])
-    return Made(
+    return Query(
         f"What is the mean of {outcome} under each of these interventions?",
         {"outcome": outcome, "dos": dos},
         found,
@@ -385,22 +382,22 @@ def _grade_prediction(answer: Any, question: Question) -> float:
     return near(float(errors.max()), question.scale)
 
 
-def _counterfactual(bench: Bench, rng: np.random.Generator) -> Made:
-    cause, outcome = _pair(bench, rng)
-    run, other = bench.unit({})
-    one = bench.quantities[cause]
-    is_low = bench.inner(cause, run[cause]) < 0.5 * (one.low + one.high)
-    value = _inside(bench, cause, 0.9 if is_low else 0.1)
+def _counterfactual(view: LevelView, rng: np.random.Generator) -> Query:
+    cause, outcome = _pair(view, rng)
+    run, other = view.unit({})
+    one = view.quantities[cause]
+    is_low = view.inner(cause, run[cause]) < 0.5 * (one.low + one.high)
+    value = _inside(view, cause, 0.9 if is_low else 0.1)
     answer = other({cause: value})[outcome]
     size = abs(answer - run[outcome])
-    if size < 0.3 * bench.spread[outcome]:
+    if size < 0.3 * view.spread[outcome]:
         raise Unusable(["the effect on this unit is within the noise"])
     seen = {name: float(one) for name, one in run.items()}
     text = (
         f"In the run below {cause} was {run[cause]:.6g}. What would {outcome} have been in this "
         f"very run, had {cause} been set to {value:g} from the beginning?"
     )
-    return Made(
+    return Query(
         text, {"cause": cause, "outcome": outcome, "value": value, "run": seen}, answer, 0.12 * size
     )
 
@@ -409,52 +406,52 @@ def _grade_number(answer: Any, question: Question) -> float:
     return near(abs(real_number("answer", answer) - question.answer), question.scale)
 
 
-def _control(bench: Bench, rng: np.random.Generator) -> Made:
+def _control(view: LevelView, rng: np.random.Generator) -> Query:
     """Draw a target that is uniform in the outcome's range, so that no constant value is likely."""
-    cause, outcome = _pair(bench, rng)
-    held, words = _held(bench, cause)
+    cause, outcome = _pair(view, rng)
+    held, words = _held(view, cause)
 
     def reached(share: float) -> float:
-        return bench.means({**held, cause: _inside(bench, cause, share)})[outcome]
+        return view.means({**held, cause: _inside(view, cause, share)})[outcome]
 
-    if np.ptp([reached(share) for share in (0.02, 0.5, 0.98)]) < 0.4 * bench.spread[outcome]:
+    if np.ptp([reached(share) for share in (0.02, 0.5, 0.98)]) < 0.4 * view.spread[outcome]:
         raise Unusable(["the outcome hardly follows"])
     shares, fine = np.linspace(0.02, 0.98, 13), np.linspace(0.02, 0.98, 1001)
     found = np.array([reached(share) for share in shares])
-    inner = bench.inner(outcome, found)  # the same target at every level
+    inner = view.inner(outcome, found)  # the same target at every level
     wanted = inner.min() + rng.uniform(0.05, 0.95) * np.ptp(inner)
     hidden = float(fine[np.argmin(np.abs(np.interp(fine, shares, inner) - wanted))])
     target = reached(hidden)
     text = f"Which value of {cause} gives {outcome} the mean {target:.6g}{words}?"
     query = {"cause": cause, "outcome": outcome, "target": target, "held": held}
-    return Made(text, query, {cause: _inside(bench, cause, hidden)}, 0.03 * float(np.ptp(found)))
+    return Query(text, query, {cause: _inside(view, cause, hidden)}, 0.03 * float(np.ptp(found)))
 
 
 def _grade_control(answer: Any, question: Question) -> float:
     cause = question.query["cause"]
     if not isinstance(answer, Mapping) or {*answer} != {cause}:
         raise UnknownOption("answer", answer, (f"{{{cause!r}: a number}}",))
-    low, high = question.bench.ends(cause)
+    low, high = question.view.ends(cause)
     value = real_number(f"answer for {cause}", answer[cause], least=low, most=high)
     do = {**question.query["held"], cause: value}
-    reached = question.bench.means(do)[question.query["outcome"]]
+    reached = question.view.means(do)[question.query["outcome"]]
     return near(abs(reached - question.query["target"]), question.scale)
 
 
-def _usual(bench: Bench) -> dict[str, float]:
+def _usual(view: LevelView) -> dict[str, float]:
     return {
-        bench.names[one.name]: _inside(bench, bench.names[one.name], 0.5)
-        for one in bench.apparatus.settable
+        view.names[one.name]: _inside(view, view.names[one.name], 0.5)
+        for one in view.testbed.settable
     }
 
 
-def _explanation(bench: Bench, rng: np.random.Generator) -> Made:
-    _, outcome = _pair(bench, rng)
-    usual, size = _usual(bench), bench.spread[outcome]
+def _explanation(view: LevelView, rng: np.random.Generator) -> Query:
+    _, outcome = _pair(view, rng)
+    usual, size = _usual(view), view.spread[outcome]
     for _ in range(8):
         far = rng.uniform(0.2, 0.45)  # the same for all, so that distances tell nothing
-        drawn = {name: _inside(bench, name, 0.5 + far * rng.choice([-1, 1])) for name in usual}
-        run, other = bench.unit(drawn)
+        drawn = {name: _inside(view, name, 0.5 + far * rng.choice([-1, 1])) for name in usual}
+        run, other = view.unit(drawn)
         apart = {name: run[outcome] - other({name: usual[name]})[outcome] for name in usual}
         sign = max((1.0, -1.0), key=lambda sign: max(sign * one for one in apart.values()))
         second, most = sorted(sign * one for one in apart.values())[-2:]
@@ -469,24 +466,24 @@ def _explanation(bench: Bench, rng: np.random.Generator) -> Made:
         f"In the run below {outcome} ended {word} {limit:.6g}: it failed. Which one of the "
         "variables decided that: had it been set to its usual value, the run would not have failed?"
     )
-    seen = {name: run[name] for name in run if not bench.quantities[name].sets}
+    seen = {name: run[name] for name in run if not view.quantities[name].sets}
     query = {"outcome": outcome, "limit": limit, "fails": word, "set": drawn, "usual": usual}
-    return Made(text, query | {"run": seen}, cause)
+    return Query(text, query | {"run": seen}, cause)
 
 
-def _diagnosis(bench: Bench, rng: np.random.Generator) -> Made:
-    usual = _usual(bench)
+def _diagnosis(view: LevelView, rng: np.random.Generator) -> Query:
+    usual = _usual(view)
     cause = str(rng.choice([*usual]))
-    value = _inside(bench, cause, float(rng.choice([0.08, 0.92])))
-    run, _ = bench.unit({**usual, cause: value})
-    still, _ = bench.unit(usual)
-    outcomes = [name for name in run if not bench.quantities[name].sets]
-    moved = [abs(run[n] - still[n]) / bench.spread[n] for n in outcomes if bench.spread[n]]
+    value = _inside(view, cause, float(rng.choice([0.08, 0.92])))
+    run, _ = view.unit({**usual, cause: value})
+    still, _ = view.unit(usual)
+    outcomes = [name for name in run if not view.quantities[name].sets]
+    moved = [abs(run[n] - still[n]) / view.spread[n] for n in outcomes if view.spread[n]]
     if max(moved) < 0.5:
         raise Unusable(["nothing is seen of it"])
     text = "In the recording below one of the variables was not at its usual value. Which one?"
     seen = {name: run[name] for name in outcomes}
-    return Made(text, {"usual": usual, "run": seen}, cause)
+    return Query(text, {"usual": usual, "run": seen}, cause)
 
 
 def _grade_name(answer: Any, question: Question) -> float:
@@ -553,7 +550,7 @@ class Question:
         level: A name of ``LEVELS``: what an agent knows beforehand.
         knobs: What makes it harder.
         draw: How many draws of this seed were not used.
-        bench: The world, as the agent meets it.
+        view: The world, as the agent meets it.
         text: The question in words.
         query: The same as data.
         answer: The exact answer.
@@ -568,7 +565,7 @@ class Question:
     level: str
     knobs: Knobs
     draw: int
-    bench: Bench = field(repr=False)
+    view: LevelView = field(repr=False)
     text: str
     query: Mapping[str, Any] = field(repr=False)
     answer: Any = field(repr=False)
@@ -588,7 +585,7 @@ class Question:
         if not isinstance(spec, Mapping) or {*spec} != {*names}:
             raise UnknownOption("spec", spec, names)
         kind, world, seed, level, knobs, draw = (spec[name] for name in names)
-        return made(kind, world, seed, level, Knobs(**knobs), draw, key)
+        return build(kind, world, seed, level, Knobs(**knobs), draw, key)
 
     @property
     def spec(self) -> dict[str, Any]:
@@ -610,23 +607,23 @@ class Question:
     @property
     def budget(self) -> int:
         """How many episodes an agent may run."""
-        return self.bench.apparatus.budget
+        return self.view.testbed.budget
 
     def describe(self) -> dict[str, Any]:
         """Return what an agent may know."""
-        bench, apparatus, first = self.bench, self.bench.apparatus, self.level == "L1"
+        view, testbed, first = self.view, self.view.testbed, self.level == "L1"
         variables = []
-        for name, one in bench.quantities.items():
+        for name, one in view.quantities.items():
             about: dict[str, Any] = {"name": name, "readable": one.reads is not None}
-            about["settable"] = list(bench.ends(name)) if one.sets else False
+            about["settable"] = list(view.ends(name)) if one.sets else False
             variables.append(about | ({"unit": one.unit, "doc": one.doc} if first else {}))
         return {
             "kind": self.kind,
-            "about": apparatus.doc if first else KINDS[self.kind].doc,
+            "about": testbed.doc if first else KINDS[self.kind].doc,
             "variables": variables,
-            "settable_variables_act_on_one_another": not apparatus.independent,
+            "settable_variables_act_on_one_another": not testbed.independent,
             "noise": self.knobs.noise,
-            "steps": apparatus.setting.get("steps", 1),
+            "steps": testbed.setting.get("steps", 1),
             "budget": self.budget,
             "answer": KINDS[self.kind].form,
             "question": self.text,
@@ -649,16 +646,16 @@ class Question:
 
 
 def check_key(key: object) -> None:
-    """Refuse a key that can be guessed: whoever has the description of a question could try it."""
+    """Refuse a key that can be guessed and then tried on the description of a question."""
     if key is not None and not (isinstance(key, str) and len(key) >= SHORTEST):
         allowed = (f"a secret text of at least {SHORTEST} characters", "None for public questions")
         raise UnknownOption("key", type(key), allowed)
 
 
-def made(
+def build(
     kind: str, world: str, seed: int, level: str, knobs: Knobs, draw: int, key: str | None
 ) -> Question:
-    """Return a draw of a question, which is not certified.
+    """Build a draw of a question, which is not certified.
 
     Its random numbers follow from an HMAC-SHA256 of kind, world, knobs, seed and draw under the
     key, so that nobody without the key can make it.
@@ -669,12 +666,12 @@ def made(
     one_of("level", level, tuple(LEVELS))
     seed, draw = whole_number("seed", seed, least=0), whole_number("draw", draw, least=0)
     check_key(key)
-    told = json.dumps([kind, world, seed, draw, asdict(knobs)])
-    hashed = hmac.new((key or "").encode(), told.encode(), hashlib.sha256).digest()
+    identity = json.dumps([kind, world, seed, draw, asdict(knobs)])
+    hashed = hmac.new((key or "").encode(), identity.encode(), hashlib.sha256).digest()
     entropy = int.from_bytes(hashed[:7], "big")
     rng = np.random.default_rng([entropy, 0])
-    bench = Bench(apparatus(world, rng, knobs), level, knobs, entropy)
-    found = KINDS[kind].make(bench, rng)
+    view = LevelView(testbed(world, rng, knobs), level, knobs, entropy)
+    found = KINDS[kind].make(view, rng)
     return Question(
         kind,
         world,
@@ -682,7 +679,7 @@ def made(
         level,
         knobs,
         draw,
-        bench,
+        view,
         found.text,
         found.query,
         found.answer,
@@ -726,14 +723,14 @@ def question(
     settings, rejected = Knobs(**knobs), list[str]()
     for draw in range(DRAWS):
         try:
-            plain = made(kind, world, seed, "L2", settings, draw, key)
+            plain = build(kind, world, seed, "L2", settings, draw, key)
         except Unusable as error:
             rejected.append(str(error))
             continue
         scores = certify(plain)
         trivial = max(scores["trivial"].values())
         if scores["solver"] >= PASSED and trivial <= FAILED:
-            found = plain if level == "L2" else made(kind, world, seed, level, settings, draw, key)
+            found = plain if level == "L2" else build(kind, world, seed, level, settings, draw, key)
             certificate = {**scores, "rejected": rejected}
             return Question(**{**vars(found), "certificate": certificate})
         rejected.append(

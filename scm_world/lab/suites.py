@@ -23,9 +23,9 @@ from scm_world.discovery.data import Dataset, as_frame, as_huggingface, collect,
 from scm_world.discovery.problems import TaskView, problem
 from scm_world.errors import ModelError, ScmWorldError, UnknownOption, reading
 from scm_world.evaluation.statistics import mean_interval
+from scm_world.lab.laboratory import brier
 from scm_world.lab.questions import (
     LEVELS,
-    PASSED,
     Question,
     Unusable,
     check_key,
@@ -50,7 +50,6 @@ ANSWER, CONFIDENCE, ID = "answer", "confidence", "question"
 """The columns of a file of answers."""
 SEEDS, NEXT = 5, 10_000
 """How many seeds are tried where one has no question, and the distance of the next one."""
-ENDS = {"score": "value", "low": "low", "high": "high"}
 
 
 def boxes() -> ModelTask:
@@ -493,7 +492,7 @@ def _overlap(answer: Any, about: Mapping[str, Any]) -> float:
 def _brier(confidence: Any, score: float | None) -> float | None:
     if confidence is None or score is None or not 0.0 <= confidence <= 1.0:
         return None
-    return float((confidence - (score >= PASSED)) ** 2)
+    return brier(confidence, score)
 
 
 def _summary(rows: pandas.DataFrame) -> pandas.DataFrame:
@@ -513,7 +512,9 @@ def _summary(rows: pandas.DataFrame) -> pandas.DataFrame:
                     "questions": len(part),
                     "answered": int(part.answered.sum()),
                     "refused": int(part.refused.sum()),
-                    **{name: getattr(interval, of) for name, of in ENDS.items()},
+                    "score": interval.value,
+                    "low": interval.low,
+                    "high": interval.high,
                     "brier": part.brier.astype(float).mean(),
                     "trivial": trivial.max() if len(trivial) else None,
                 }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
 from typing import Any, NamedTuple, final
@@ -34,7 +34,7 @@ Edge = tuple[str, str]
 
 @final
 @dataclass(frozen=True)
-class Quantity:
+class LabVariable:
     """Something that an agent can read, or set, or both.
 
     Attributes:
@@ -60,7 +60,7 @@ class Quantity:
 
 @final
 @dataclass(frozen=True)
-class Apparatus:
+class Testbed:
     """A world, and what may be set and read in it.
 
     Attributes:
@@ -72,12 +72,12 @@ class Apparatus:
         independent: Whether the settable quantities do not act on one another.
         edges: True edges between quantities, and pairs with a hidden common cause.
         confounded: Pairs with a hidden common cause.
-        own: Edges that are told and not asked.
+        own: Edges that the question states.
         doc: What the world is, for the level L1.
     """
 
     world: Questions
-    quantities: tuple[Quantity, ...]
+    quantities: tuple[LabVariable, ...]
     setting: Mapping[str, Any]
     budget: int
     doc: str
@@ -85,15 +85,15 @@ class Apparatus:
     independent: bool = True
     edges: tuple[Edge, ...] = ()
     confounded: tuple[Edge, ...] = ()
-    own: tuple[Edge, ...] = field(default=())
+    own: tuple[Edge, ...] = ()
 
     @property
-    def settable(self) -> tuple[Quantity, ...]:
+    def settable(self) -> tuple[LabVariable, ...]:
         """The quantities that may be set."""
         return tuple(one for one in self.quantities if one.sets)
 
     @property
-    def outcomes(self) -> tuple[Quantity, ...]:
+    def outcomes(self) -> tuple[LabVariable, ...]:
         """The quantities that are read; those alone that cannot be set, if there are any."""
         read = tuple(one for one in self.quantities if one.reads)
         return tuple(one for one in read if not one.sets) or read
@@ -158,7 +158,7 @@ def bent(*parents: Any, noise: Any = 0.0, weights: Sequence[float], law: float) 
     return total
 
 
-def equations(rng: np.random.Generator, knobs: Knobs) -> Apparatus:
+def equations(rng: np.random.Generator, knobs: Knobs) -> Testbed:
     """Draw a random acyclic model; a hidden variable acts on two of the others."""
     n, extra = knobs.variables, knobs.distractors
     names = [f"x{i}" for i in rng.permutation(n + extra)]
@@ -185,10 +185,10 @@ def equations(rng: np.random.Generator, knobs: Knobs) -> Apparatus:
             made.append(Exogenous(name=name, distribution=Normal()))
     made += [Exogenous(name=name, distribution=Normal()) for name in names[n:]]
     quantities = tuple(
-        Quantity(name, "1", "A variable of the model.", Outcome(name), name, low, high)
+        LabVariable(name, "1", "A variable of the model.", Outcome(name), name, low, high)
         for name in sorted(names)
     )
-    return Apparatus(
+    return Testbed(
         SCM(made),
         quantities,
         {},
@@ -201,7 +201,7 @@ def equations(rng: np.random.Generator, knobs: Knobs) -> Apparatus:
     )
 
 
-def servos(rng: np.random.Generator, knobs: Knobs) -> Apparatus:
+def servos(rng: np.random.Generator, knobs: Knobs) -> Testbed:
     """Draw a network of arms whose servos follow one another's angles."""
     n = max(5, knobs.variables)
     made = servo(n, int(rng.integers(2**31)), int(knobs.hidden))
@@ -211,7 +211,7 @@ def servos(rng: np.random.Generator, knobs: Knobs) -> Apparatus:
         held: Any = made.holds[command]
         box = drawn[f"{command.partition('.')[0]}.hold"].distribution
         quantities.append(
-            Quantity(
+            LabVariable(
                 arm.partition(".")[0],
                 "rad",
                 "The angle at which an arm comes to rest; an experiment holds it.",
@@ -225,7 +225,7 @@ def servos(rng: np.random.Generator, knobs: Knobs) -> Apparatus:
     short = {arm: arm.partition(".")[0] for arm in made.arms.values()}
     forces = sorted({cause for cause, _ in made.edges} - {*short})
     pairs = [tuple(short[e] for c, e in made.edges if c == force) for force in forces]
-    return Apparatus(
+    return Testbed(
         World(made.task).given(made.plan),
         tuple(quantities),
         {"policy": None, "steps": made.steps},
@@ -237,7 +237,7 @@ def servos(rng: np.random.Generator, knobs: Knobs) -> Apparatus:
     )
 
 
-def network(rng: np.random.Generator, knobs: Knobs) -> Apparatus:
+def network(rng: np.random.Generator, knobs: Knobs) -> Testbed:
     """Draw masses on a random network of springs; an episode is one physics step."""
     task = Springs(max(6, knobs.variables), int(rng.integers(2**31)))
     names = sorted(task.masses)
@@ -246,25 +246,21 @@ def network(rng: np.random.Generator, knobs: Knobs) -> Apparatus:
     for name in names:
         at, speed = f"{name}.position", f"{name}.velocity"
         doc = "Where it begins; an experiment puts it there."
-        places.append(Quantity(at, "m", doc, Outcome(at, "first"), at, -0.5, 0.5))
-        speeds.append(Quantity(speed, "m/s", "After 0.02 s, from rest.", Outcome(speed)))
+        places.append(LabVariable(at, "m", doc, Outcome(at, "first"), at, -0.5, 0.5))
+        speeds.append(LabVariable(speed, "m/s", "After 0.02 s, from rest.", Outcome(speed)))
     given = {one.name: Draw(Box(-0.3, 0.3)) for one in places}
     together = {"*.position": Shift(Draw(Box(-0.3, 0.3)), shared=True)} if knobs.hidden else None
-    return Apparatus(
+    return Testbed(
         World(task).given(given),
         (*places, *speeds),
         {"policy": None, "steps": 1, "nature": together},
         120,
         f"{len(names)} masses on rails, with springs between some of them.",
         edges=tuple(
-            (f"{a}.position", f"{b}.velocity") for a, b in sorted(near | {*map(_turned, near)})
+            (f"{a}.position", f"{b}.velocity") for a, b in sorted(near | {(b, a) for a, b in near})
         ),
         own=tuple((f"{n}.position", f"{n}.velocity") for n in names),
     )
-
-
-def _turned(pair: Edge) -> Edge:
-    return pair[1], pair[0]
 
 
 # --- physics with causes that do not act on one another -------------------------------------------
@@ -469,9 +465,9 @@ def file_rig(path: str) -> Rig:
     return Rig(lambda _law, _k: path, causes, dict.fromkeys(states[-2:], "1"), 1.0, f"{path}.")
 
 
-def rig(made: Rig, rng: np.random.Generator, knobs: Knobs) -> Apparatus:
+def rig(made: Rig, rng: np.random.Generator, knobs: Knobs) -> Testbed:
     """Make a rig; a hidden common cause moves all of its causes."""
-    k, quantities = rng.uniform(0.7, 1.4, 3), list[Quantity]()
+    k, quantities = rng.uniform(0.7, 1.4, 3), list[LabVariable]()
     ties, follows = [Exogenous(name="driver", distribution=Box(-1.0, 1.0))], dict[str, Any]()
     for cause, (unit, low, high) in made.causes.items():
         ties.append(Exogenous(name=f"own.{cause}", distribution=Box(-1.0, 1.0)))
@@ -481,15 +477,15 @@ def rig(made: Rig, rng: np.random.Generator, knobs: Knobs) -> Apparatus:
         law = Linear(weights=weights, intercept=low + half)
         follows[cause] = Mechanism(law, parents=("driver", f"own.{cause}"))
         doc = "Where it is set, or is by itself, at the beginning."
-        quantities.append(Quantity(cause, unit, doc, Outcome(cause, "first"), cause, low, high))
+        quantities.append(LabVariable(cause, unit, doc, Outcome(cause, "first"), cause, low, high))
     for i in range(knobs.distractors):
         lamp = f"lamp{i}.brightness"
         ties.append(Exogenous(name=lamp, unit="cd", distribution=Box(0.0, 1.0)))
-        quantities.append(Quantity(lamp, "cd", "A lamp.", Outcome(lamp), lamp, 0.0, 1.0))
+        quantities.append(LabVariable(lamp, "cd", "A lamp.", Outcome(lamp), lamp, 0.0, 1.0))
     outcomes = [(what, how) for what in made.reads for how in ("final", "mean", "max")]
     for what, how in outcomes:
         doc = f"The {how} value over the episode."
-        quantities.append(Quantity(f"{what}.{how}", made.reads[what], doc, Outcome(what, how)))
+        quantities.append(LabVariable(f"{what}.{how}", made.reads[what], doc, Outcome(what, how)))
     for command, of in made.agent.items():
         follows[command] = Mechanism(Linear(weights=tuple(of.values())), parents=tuple(of))
     task = ModelTask(
@@ -499,7 +495,7 @@ def rig(made: Rig, rng: np.random.Generator, knobs: Knobs) -> Apparatus:
         control_dt=made.seconds / made.steps,
         seconds=made.seconds,
     )
-    return Apparatus(
+    return Testbed(
         World(task).given(follows),
         tuple(quantities),
         {"policy": None, "steps": made.steps},
@@ -509,7 +505,7 @@ def rig(made: Rig, rng: np.random.Generator, knobs: Knobs) -> Apparatus:
     )
 
 
-WORLDS: Mapping[str, tuple[Callable[[np.random.Generator, Knobs], Apparatus], str]] = {
+WORLDS: Mapping[str, tuple[Callable[[np.random.Generator, Knobs], Testbed], str]] = {
     "equations": (equations, "A random acyclic model of equations."),
     "servo": (servos, "Arms whose servos follow one another."),
     "network": (network, "Masses on a random network of springs, for one step."),
@@ -517,8 +513,8 @@ WORLDS: Mapping[str, tuple[Callable[[np.random.Generator, Knobs], Apparatus], st
 }
 
 
-def apparatus(world: str, rng: np.random.Generator, knobs: Knobs) -> Apparatus:
-    """Make the apparatus of a world of ``WORLDS``, or of a model file."""
+def testbed(world: str, rng: np.random.Generator, knobs: Knobs) -> Testbed:
+    """Make the testbed of a world of ``WORLDS``, or of a model file."""
     if world in WORLDS:
         return WORLDS[world][0](rng, knobs)
     return rig(file_rig(world), rng, knobs)

@@ -8,23 +8,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from pendulum import PENDULUM
 from typer.testing import CliRunner
 
 import scm_world as sw
 from scm_world.cli.app import app
 from scm_world.fit.shooting import Shooting
 
-PENDULUM = """
-<mujoco model="pendulum">
-  <worldbody>
-    <body name="pole">
-      <joint name="hinge" axis="0 1 0" damping="0.01"/>
-      <geom name="rod" type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="0.2"/>
-    </body>
-  </worldbody>
-  <actuator><motor name="motor" joint="hinge" ctrlrange="-1 1"/></actuator>
-</mujoco>
-"""
 NAMES = ["hinge.damping", "pole.mass"]
 
 

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 import pandas as pd
 import pytest
+from pendulum import PENDULUM
 from typer.testing import CliRunner
 
 import scm_world as sw
@@ -25,18 +26,6 @@ from scm_world.errors import (
 )
 from scm_world.fit.recordings import Reading, RecordedRun, read_recording
 
-PENDULUM = """
-<mujoco model="pendulum">
-  <option timestep="0.002"/>
-  <worldbody>
-    <body name="pole">
-      <joint name="hinge" axis="0 1 0" damping="0.01"/>
-      <geom name="rod" type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="0.2"/>
-    </body>
-  </worldbody>
-  <actuator><motor name="motor" joint="hinge" ctrlrange="-1 1"/></actuator>
-</mujoco>
-"""
 BEGIN = 1_700_000_000_123_456_789  # [ns]
 DT = 20_000_000  # [ns]
 KINDS = ("sqlite3", "mcap", "file.mcap", "ros1")

@@ -7,21 +7,11 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from pendulum import PENDULUM
 from scipy.stats import t as student
 
 import scm_world as sw
 
-PENDULUM = """
-<mujoco model="pendulum">
-  <worldbody>
-    <body name="pole">
-      <joint name="hinge" axis="0 1 0" damping="0.01"/>
-      <geom name="rod" type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="0.2"/>
-    </body>
-  </worldbody>
-  <actuator><motor name="motor" joint="hinge" ctrlrange="-1 1"/></actuator>
-</mujoco>
-"""
 NOISE = 1e-3  # [rad]
 CART = """
 <mujoco><option timestep="0.01" gravity="0 0 0"/>

@@ -8,24 +8,13 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from pendulum import PENDULUM
 from scipy import stats
 
 import scm_world as sw
 from scm_world.fit import fitting
 from scm_world.fit.problem import projected
 
-PENDULUM = """
-<mujoco model="pendulum">
-  <option timestep="0.002"/>
-  <worldbody>
-    <body name="pole">
-      <joint name="hinge" axis="0 1 0" damping="0.01"/>
-      <geom name="rod" type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="0.2"/>
-    </body>
-  </worldbody>
-  <actuator><motor name="motor" joint="hinge" ctrlrange="-1 1"/></actuator>
-</mujoco>
-"""
 TRUE = {"hinge.damping": 0.02, "pole.mass": 0.25}
 BLOCKS = 10
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pendulum import PENDULUM
 
 import scm_world as sw
 from scm_world.fit.fitting import arguments_of
@@ -13,18 +14,6 @@ from scm_world.fit.problem import windows_of
 from scm_world.fit.shooting import Shooting
 from scm_world.fit.thinning import ENOUGH, thinned
 
-PENDULUM = """
-<mujoco model="pendulum">
-  <option timestep="0.002"/>
-  <worldbody>
-    <body name="pole">
-      <joint name="hinge" axis="0 1 0" damping="0.01"/>
-      <geom name="rod" type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="0.2"/>
-    </body>
-  </worldbody>
-  <actuator><motor name="motor" joint="hinge" ctrlrange="-1 1"/></actuator>
-</mujoco>
-"""
 NAMES = ["hinge.damping", "pole.mass"]
 
 

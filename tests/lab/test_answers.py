@@ -12,7 +12,7 @@ import pytest
 
 from scm_world import lab
 from scm_world.errors import ModelError
-from scm_world.lab.questions import Unusable, made
+from scm_world.lab.questions import Unusable, build
 from scm_world.lab.worlds import RIGS, WORLDS, equations
 
 
@@ -23,7 +23,7 @@ def drawn(kind: str, world: str, n: int, **knobs: Any) -> list[lab.Question]:
         if len(found) == n:
             break
         try:
-            found.append(made(kind, world, 7, "L2", lab.Knobs(**knobs), draw, None))
+            found.append(build(kind, world, 7, "L2", lab.Knobs(**knobs), draw, None))
         except Unusable:
             continue
     assert len(found) == n
@@ -32,7 +32,7 @@ def drawn(kind: str, world: str, n: int, **knobs: Any) -> list[lab.Question]:
 
 def weights(asked: lab.Question) -> tuple[list[str], np.ndarray]:
     """Return the names of a linear model, and its weights, shape (n, n), from column to row."""
-    model: Any = asked.bench.apparatus.world
+    model: Any = asked.view.testbed.world
     names = list(model)
     found = np.zeros((len(names), len(names)))
     for row, name in enumerate(names):
@@ -99,11 +99,11 @@ def test_no_constant_answer_reaches_many_targets(law: str, monkeypatch: pytest.M
     found = []
     for asked in drawn("control", "equations", 35, law=law):
         ((cause, _),) = asked.answer.items()
-        low, high = asked.bench.ends(cause)
+        low, high = asked.view.ends(cause)
         shares = (0.0, 0.12, 0.3, 0.5, 0.7, 0.88, 1.0)
         found.append([asked.grade({cause: low + share * (high - low)}) for share in shares])
     again = lab.Question.of({**asked.spec, "level": "L4"})
-    inner = [again.bench.inner(*pair) for pair in again.answer.items()]
+    inner = [again.view.inner(*pair) for pair in again.answer.items()]
     np.testing.assert_allclose(inner, [*asked.answer.values()], atol=0.002 * (high - low))
     assert np.mean(found, axis=0).max() <= 0.25  # 0.13 are expected, of 35 questions
 
@@ -113,7 +113,7 @@ def test_explanations_set_all_variables_at_the_same_distance() -> None:
     for level in ("L2", "L4"):
         (asked,) = drawn("explanation", "springs", 1)
         asked = lab.Question.of({**asked.spec, "level": level})
-        q, ends = asked.query, asked.bench.ends
+        q, ends = asked.query, asked.view.ends
         far = [abs(q["set"][n] - q["usual"][n]) / np.ptp(ends(n)) for n in q["set"]]
         np.testing.assert_allclose(far, far[0], atol=1e-5)
         assert far[0] >= 0.2
@@ -133,7 +133,7 @@ def test_edges_of_equations_are_those_of_their_weights() -> None:
 
 def simulated(asked: lab.Question, values: Mapping[str, float]) -> dict[str, float]:
     """Return the readings of springs, by a loop over steps of MuJoCo."""
-    k = np.random.default_rng([asked.bench.entropy, 0]).uniform(0.7, 1.4, 3)
+    k = np.random.default_rng([asked.view.entropy, 0]).uniform(0.7, 1.4, 3)
     model = mujoco.MjModel.from_xml_string(RIGS["springs"].xml(asked.knobs.law, k))
     data = mujoco.MjData(model)
     for name in ("left", "right"):
@@ -176,7 +176,7 @@ def test_explanations_and_diagnoses_of_springs_are_those_of_mujoco() -> None:
     (asked,) = drawn("diagnosis", "springs", 1)
     usual, run = asked.query["usual"], asked.query["run"]
     value = [
-        asked.bench.ends(asked.answer)[0] + share * np.ptp(asked.bench.ends(asked.answer))
+        asked.view.ends(asked.answer)[0] + share * np.ptp(asked.view.ends(asked.answer))
         for share in (0.08, 0.92)
     ]
     found = [simulated(asked, {**usual, asked.answer: one}) for one in value]
@@ -216,7 +216,7 @@ def test_a_model_file_is_a_world(tmp_path: Any) -> None:
     path = tmp_path / "own.xml"
     path.write_text(RIGS["lever"].xml("plain", np.ones(3)))
     asked = lab.question("effect", str(path), seed=0)
-    assert "left.mass" in asked.bench.quantities
+    assert "left.mass" in asked.view.quantities
     path.write_text("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
     with pytest.raises(ModelError, match="no joint"):
         lab.question("effect", str(path))

@@ -16,7 +16,7 @@ from scm_world import lab
 from scm_world.errors import ScmWorldError
 from scm_world.lab.agents import _confounded
 from scm_world.lab.expressions import evaluate
-from scm_world.lab.questions import made
+from scm_world.lab.questions import build
 
 
 def test_a_question_is_answered_by_the_solver_and_by_no_trivial_answer() -> None:
@@ -170,11 +170,11 @@ class Tools:
 @pytest.mark.parametrize("kind", ["control", "prediction"])
 def test_the_random_agent_needs_the_tools_only(kind: str) -> None:
     """Through other hands it does the same."""
-    asked = made(kind, "equations", 1, "L2", lab.Knobs(), 0, None)
+    asked = build(kind, "equations", 1, "L2", lab.Knobs(), 0, None)
     room = lab.Laboratory(asked)
     lab.AGENTS["random"](Tools(room))  # type: ignore[arg-type]
     assert room.record() == lab.play("random", asked).record()
-    other = lab.play("random", made(kind, "equations", 2, "L2", lab.Knobs(), 0, None))
+    other = lab.play("random", build(kind, "equations", 2, "L2", lab.Knobs(), 0, None))
     assert other.calls[1] != room.calls[1]
 
 
