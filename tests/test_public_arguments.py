@@ -44,7 +44,7 @@ from scm_world import (
 from scm_world import env as environments
 from scm_world.discovery import data, learners, problems, representations
 from scm_world.errors import ModelError, ScmWorldError
-from scm_world.lab.questions import made as made_question
+from scm_world.lab.questions import build as build_question
 from scm_world.policies import planning
 from scm_world.queries.local import local_graph
 from scm_world.tasks import families
@@ -410,7 +410,7 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
         "policy": None, "task": None, "trusted": (), "progress": None,
     }  # fmt: skip
     # Laboratories.
-    asked_for = made_question("effect", "equations", 0, "L2", lab.Knobs(), 0, None)
+    asked_for = build_question("effect", "equations", 0, "L2", lab.Knobs(), 0, None)
     yield lab.Knobs, dataclasses.asdict(lab.Knobs())
     yield lab.Laboratory, {"question": asked_for}
     yield lab.LabEnv, {

@@ -1,4 +1,4 @@
-"""Questions about a world, with exact answers."""
+"""Questions about a world, with the answers that its simulation gives."""
 
 from __future__ import annotations
 
@@ -553,7 +553,7 @@ class Question:
         view: The world, as the agent meets it.
         text: The question in words.
         query: The same as data.
-        answer: The exact answer.
+        answer: The answer of the simulation; means have a sampling error.
         scale: The error up to which an answer has score 1.
         seal: The key of ``digest``: of a private question, nobody can try answers against it.
         certificate: Scores of the solver and of trivial answers, and why draws were rejected.
