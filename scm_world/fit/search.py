@@ -11,6 +11,7 @@ import numpy as np
 from scm_world._types import Floats, Integers
 from scm_world.fit.problem import (
     PRIOR,
+    STEP,
     FitProblem,
     LeastSquares,
     LinearWindow,
@@ -22,6 +23,7 @@ from scm_world.fit.problem import (
     projected,
     windows_of,
 )
+from scm_world.fit.targets import blocks_of
 
 SEARCHES = 6  # largest number of searches for the best minimum
 SAME = 3.0  # largest difference of the loss of equal minima
@@ -398,15 +400,27 @@ class Minima:
     def certain(self, best: Result, active: Sequence[int]) -> list[LinearWindow]:
         """Return the linearised windows, or others over wide steps that determine less.
 
-        Where an impact comes or goes within a small step, derivatives would be far too large.
+        Where an impact comes or goes within a small step, derivatives would be far too large. Of an
+        inertia some combinations never act, which differences to both sides show.
         """
         at = best.at
-        if best.smooth or not active:
-            return at.made
         linear = LeastSquares(self.problem, self.problem.windows, best.noise, active).linear
+        made = at.made
+        if blocks_of(self.problem.targets) and active:
+            back = linear(at.scaled, at.starts, step=-STEP, of_states=-STEP)
+            made = [
+                dataclasses.replace(
+                    one,
+                    states=0.5 * (one.states + other.states),
+                    parameters=0.5 * (one.parameters + other.parameters),
+                )
+                for one, other in zip(made, back, strict=True)
+            ]
+        if best.smooth or not active:
+            return made
         wide = (linear(at.scaled, at.starts, step=one, of_states=one) for one in (WIDE, -WIDE))
         chosen = []
-        for each in zip(at.made, *wide, strict=True):
+        for each in zip(made, *wide, strict=True):
             sizes = np.array([np.linalg.norm(one.projected[1]) for one in each])
             one = each[int(sizes.argmin())] if sizes.min() < LESS * sizes[0] else each[0]
             chosen.append(dataclasses.replace(one, residual=each[0].residual))
