@@ -20,6 +20,7 @@ from scm_world.fit.inertia import LOGS
 from scm_world.fit.prediction import Prediction, predicted
 from scm_world.fit.problem import (
     PRIOR,
+    ROUNDING,
     SHORT,
     STEP,
     WINDOW,
@@ -77,7 +78,6 @@ AWAY = 0.5  # of the spread of a state in the recording, at which it is far from
 WORSE = 1.1  # times the error of the unfitted world, with which a fit replays worse than it
 LEFT = 0.5  # share of the variance within windows that a fit leaves which does not follow them
 SHOWN = 5  # outliers that are named
-ROUNDING = 1e-4  # least effect of a combination of inertias, in that of the best one
 SHARE = 0.01  # least one of an undetermined combination in a number without an interval
 MAIN = 0.3  # least share of a parameter in a combination that is named
 DRAWN = 8  # columns of a picture
@@ -615,7 +615,14 @@ class Fit:
         They are drawn together, from the normal distribution of the scaled parameters that
         ``counterfactual`` uses, within their ranges: ``start=fit.posterior()`` of an environment
         randomises by what was not determined. A delay is not among them.
+
+        Raises:
+            ModelError: A whole inertia was fitted: its four variables have no normal distribution.
         """
+        if blocks := blocks_of(self.targets):
+            names = ", ".join(block.name for block, _ in blocks)
+            problem = f"{names} has four variables, which have no normal distribution together"
+            raise ModelError([f"{problem}: fit single parameters, such as the mass, to draw them"])
         return posterior_of(self.targets, self.scaled, self.spread)
 
     @typed
