@@ -135,15 +135,15 @@ def _solve_graph(known: _Known) -> Any:
     if together:
         return {"edges": edges, "hidden": []}
     seen = _experiment(known.room, {}, known.room.remaining)
-    return {"edges": edges, "hidden": _confounded(seen, edges, tables)}
-
-
-def _confounded(seen: Columns, edges: list[list[str]], tables: Mapping[str, Columns]) -> Any:
-    """Return pairs whose parts without a cause are correlated in observations."""
-    left = {}
+    unexplained = dict[str, Floats]()
     for outcome, table in tables.items():
         causes = [c for c, e in edges if e == outcome]
-        left[outcome] = seen[outcome] - _model(table, causes, table[outcome])(seen)
+        unexplained[outcome] = seen[outcome] - _model(table, causes, table[outcome])(seen)
+    return {"edges": edges, "hidden": _confounded(unexplained)}
+
+
+def _confounded(left: Mapping[str, Floats]) -> Any:
+    """Return pairs whose parts without a cause, in observations, are correlated."""
     n = len(next(iter(left.values())))
     return [
         [a, b]
@@ -169,7 +169,7 @@ def _solve_law(known: _Known) -> Any:
     """Return the mean of an outcome as an expression of its cause."""
     cause, outcome = known.query["cause"], known.query["outcome"]
     low, high = known.ends[cause]
-    places = np.linspace(low, high, 32 if known.query["held"] else 16)
+    places = np.linspace(low, high, min(32 if known.query["held"] else 16, known.budget))
     n = known.budget // len(places)
     dos = [{**known.query["held"], cause: float(place)} for place in places]
     y = np.array([_experiment(known.room, do, n)[outcome].mean() for do in dos])
@@ -223,7 +223,8 @@ def _solve_explanation(known: _Known) -> Any:
 
 def _solve_diagnosis(known: _Known) -> Any:
     q, outcomes = known.query, [*known.query["run"]]
-    n = known.budget // (4 * len(known.ends) + 2)
+    shares = (0.08, 0.3, 0.7, 0.92) if known.budget > 4 * len(known.ends) + 1 else (0.08, 0.92)
+    n = known.budget // (len(shares) * len(known.ends) + 2)
 
     def readings(do: Mapping[str, Any], many: int) -> Floats:
         table = _experiment(known.room, do, many)
@@ -233,13 +234,12 @@ def _solve_diagnosis(known: _Known) -> Any:
     run, errors = np.array([q["run"][o] for o in outcomes]), dict[str, float]()
     places: dict[str, list[Floats]] = {}
     for name, (low, high) in known.ends.items():
-        shares = (0.08, 0.3, 0.7, 0.92)
         places[name] = [
             readings({**q["usual"], name: low + share * (high - low)}, n) for share in shares
         ]
     size = np.std([one for many in places.values() for one in many], axis=0) + 1e-12
     for name, many in places.items():
-        line = [*many[:2], usual, *many[2:]]
+        line = [*many[: len(many) // 2], usual, *many[len(many) // 2 :]]
         errors[name] = min(
             _distance(run / size, one / size, other / size) for one, other in pairwise(line)
         )
@@ -326,8 +326,8 @@ def certify(question: Question) -> dict[str, Any]:
 
 # --- agents that choose one experiment after another ----------------------------------------------
 
-ROUNDS, PRIOR = 16, 0.01
-"""Experiments of a run, and the precision of a weight before them, in that of a reading."""
+ROUNDS, GRID, PRIOR = 16, 33, 0.01
+"""Experiments of a run; places of a law; prior precision of a weight, in that of a reading."""
 
 
 class _Seen:
@@ -340,7 +340,7 @@ class _Seen:
 
     def __init__(self, known: _Known, rng: np.random.Generator) -> None:
         self.known, self.rng, self.turn = known, rng, 0
-        self.by_value = known.independent or known.kind in ("graph", "prediction")
+        self.by_value = known.independent or known.kind == "prediction"
         self.outcomes = [n for n in known.readable if n not in known.ends] or known.readable
         self.rows = {name: np.zeros(0) for name in known.readable}
         self.is_set = {name: np.zeros(0, bool) for name in known.ends}
@@ -368,9 +368,11 @@ class _Seen:
     def under(self, do: Mapping[str, Any], n: int) -> dict[str, Floats]:
         """Return columns of n rows under an intervention; all else is as where it was not set."""
         others = [was for name, was in self.is_set.items() if name not in do]
-        free = np.flatnonzero(~np.any(others, axis=0)) if others else []
-        at = np.resize(free if len(free) else np.arange(len(self.rows[self.outcomes[0]])), n)
-        drawn = {name: self.rng.uniform(*(np.ravel(v)[[0, -1]]), n) for name, v in do.items()}
+        every = np.arange(len(self.rows[self.outcomes[0]]))
+        free = every[~np.any(others, axis=0)] if others else every
+        at = np.resize(free if len(free) else every, n)
+        ends = {name: np.ravel(value) for name, value in do.items()}
+        drawn = {name: self.rng.uniform(end[0], end[-1], n) for name, end in ends.items()}
         rows = {name: self.rows[name][at] for name in self.known.ends} | drawn
         return self.columns(rows, {name: name in do for name in self.known.ends})
 
@@ -389,17 +391,31 @@ class _Seen:
         fitted = _model(columns, self.causes(outcome, every), self.rows[outcome][kept])
         return np.array([fitted(self.under(do, 40)).mean() for do in dos])
 
+    def unexplained(self, outcome: str, causes: list[str]) -> Floats:
+        """Return what causes leave of an outcome; the values that were set are instruments."""
+        free, y = self.free(outcome), self.rows[outcome]
+        one = np.ones((1, len(y)))
+        x = np.vstack([one, *(self.rows[c] for c in causes)])
+        z = np.vstack([one, *(np.where(self.is_set[c], self.rows[c], 0.0) for c in causes)])
+        weights = np.linalg.lstsq(z[:, free] @ x[:, free].T, z[:, free] @ y[free], rcond=None)[0]
+        return np.asarray(y - weights @ x)
+
     def edges(self) -> list[list[str]]:
         """Return the edges that ``do_order`` finds; none from a variable that was never set."""
-        names = [*self.rows]
-        table = np.stack([*self.rows.values()], axis=1)
+        # Noise that is never set makes do_order allow for hidden causes of all variables.
+        noise = self.rng.normal(size=len(self.rows[self.outcomes[0]]))
+        columns = self.rows if self.outcomes != self.known.readable else {**self.rows, "": noise}
+        names, table = [*columns], np.stack([*columns.values()], axis=1)
         sets = np.stack([*self.is_set.values()], axis=1)
         if len(table) < 3 or not sets.any():
             return []
         targets = [[n for n, one in zip(self.is_set, row, strict=True) if one] for row in sets]
         data = Dataset.of(table, names, targets=targets)
         # What cannot be set comes last in an episode.
-        ends = [replace(c, how="value" if c.name in self.is_set else "final") for c in data.columns]
+        ends = [
+            replace(c, how="value" if c.name in ("", *self.is_set) else "final")
+            for c in data.columns
+        ]
         graph = do_order(replace(data, columns=tuple(ends)))
         return [[a, b] for a, b, _ in graph.directed if b in self.outcomes]
 
@@ -412,7 +428,8 @@ def _asked(seen: _Seen, query: Mapping[str, Any] | None) -> list[dict[str, float
         case "effect":
             return [{q["cause"]: q[end]} for end in ("to", "from")]
         case "law" | "control":
-            places = np.linspace(*ends[q["cause"]], 33)
+            low, high = ends[q["cause"]]
+            places = np.linspace(low, high, GRID)
             return [{**q["held"], q["cause"]: float(place)} for place in places]
         case "counterfactual":
             was = {c: float(np.clip(q["run"][c], *ends[c])) for c in ends}
@@ -422,8 +439,8 @@ def _asked(seen: _Seen, query: Mapping[str, Any] | None) -> list[dict[str, float
             return [{**q["set"], name: q["usual"][name]} for name in ends]
         case "diagnosis":
             shares = np.linspace(0.02, 0.98, 13)
-            places = {n: low + shares * (high - low) for n, (low, high) in ends.items()}
-            return [{**q["usual"], n: float(x)} for n, many in places.items() for x in many]
+            tried = [(n, low + shares * (high - low)) for n, (low, high) in ends.items()]
+            return [{**q["usual"], n: float(x)} for n, many in tried for x in many]
     points = [{n: float(seen.rng.uniform(*e)) for n, e in ends.items()} for _ in range(24)]
     return list(q.get("dos", points))
 
@@ -470,25 +487,21 @@ def _informative(seen: _Seen, n: int) -> dict[str, Any]:
 
 def _next(design: str, seen: _Seen, n: int) -> dict[str, Any]:
     """Return the next experiment of a design; values are drawn in the whole range."""
-    names, turn = [*seen.known.ends], seen.turn - 1
-    if turn < 0:
-        return {}
-    some: tuple[str, ...] = (names[turn % len(names)],)
+    names, turn = [*seen.known.ends], seen.turn
+    every: list[tuple[str, ...]] = [(), *((name,) for name in names)]
     match design:
         case "random":
-            some = (str(seen.rng.choice(names)),)
+            turn = int(seen.rng.integers(len(every))) if turn else 0
         case "pairs":
-            pairs = [*combinations(names, 2)]
-            some = pairs[turn % len(pairs)]
-        case "do_order" if turn >= len(names):
+            every = [(), *combinations(names, 2)]
+        case "do_order" if turn >= len(every):
             query, graph = seen.known.query or {}, nx.DiGraph(map(tuple, seen.edges()))
             ends = [query["outcome"]] if "outcome" in query else seen.outcomes
             found = {c for end in ends if end in graph for c in nx.ancestors(graph, end)}
-            kept = [name for name in names if name in found] or names
-            some = (kept[turn % len(kept)],)
-        case "information":
+            every = [(name,) for name in names if name in found] or every
+        case "information" if turn:
             return _informative(seen, n)
-    return {name: seen.known.ends[name] for name in some}
+    return {name: seen.known.ends[name] for name in every[turn % len(every)]}
 
 
 def _explore(design: str, room: Laboratory) -> None:
@@ -508,17 +521,11 @@ def _estimated(seen: _Seen, q: Mapping[str, Any]) -> Any:
     kind, ends = seen.known.kind, seen.known.ends
     if kind == "graph":
         edges = [edge for edge in seen.edges() if edge not in q["known"]]
-        watched = {
-            name: column[~np.any([*seen.is_set.values()], axis=0)]
-            for name, column in seen.rows.items()
-        }
-        if seen.outcomes != seen.known.readable or len(watched[seen.outcomes[0]]) < 8:
+        watched = ~np.any([*seen.is_set.values()], axis=0)
+        if seen.outcomes != seen.known.readable or np.sum(watched) < 8:
             return {"edges": edges, "hidden": []}
-        tables = {
-            o: {name: column[seen.free(o)] for name, column in seen.rows.items()}
-            for o in seen.outcomes
-        }
-        return {"edges": edges, "hidden": _confounded(watched, edges, tables)}
+        left = {o: seen.unexplained(o, [c for c, e in edges if e == o]) for o in seen.outcomes}
+        return {"edges": edges, "hidden": _confounded({o: y[watched] for o, y in left.items()})}
     dos = _asked(seen, q)
     if kind == "diagnosis":
         size = {o: float(np.std(seen.rows[o])) + 1e-12 for o in q["run"]}
@@ -536,10 +543,11 @@ def _estimated(seen: _Seen, q: Mapping[str, Any]) -> Any:
         case "explanation":
             sign = 1.0 if q["fails"] == "above" else -1.0
             return [*ends][int(np.argmin(sign * found))]
-    places = np.linspace(*ends[q["cause"]], 33)
+    low, high = ends[q["cause"]]
+    places = np.linspace(low, high, GRID)
     if kind == "law":
         return _curve(q["cause"], places, found)
-    grid = np.linspace(places[0], places[-1], 2001)
+    grid = np.linspace(low, high, 2001)
     near = np.argmin(np.abs(np.interp(grid, places, found) - q["target"]))
     return {q["cause"]: float(grid[near])}
 

@@ -168,7 +168,8 @@ class Tools:
 
 
 @pytest.mark.parametrize(
-    ("agent", "kind"), zip(DESIGNS, ("graph", "control", "law", "graph", "prediction"), strict=True)
+    ("agent", "kind"),
+    [*zip(DESIGNS, ("graph", "control", "law", "graph", "prediction"), strict=True)],
 )
 def test_agents_need_the_tools_only(agent: str, kind: str) -> None:
     """Through other hands each does the same; it spends the budget."""
@@ -221,7 +222,7 @@ def test_equal_residuals_share_a_cause() -> None:
     same = np.random.default_rng(0).normal(size=40)
     table = {"a": same, "b": -same, "c": np.random.default_rng(1).normal(size=40)}
     with np.errstate(all="raise"):
-        found = _confounded(table, [], dict.fromkeys(table, table))
+        found = _confounded(table)
     assert found == [["a", "b"]]
 
 
