@@ -303,9 +303,10 @@ def _laws(law: str, k: Floats, stiffness: float, damping: float) -> str:
 
 
 def _body(name: str, at: str, joint: str, geom: str) -> str:
+    color = "0.8 0.3 0.2 1" if name in ("left", "first") else "0.2 0.4 0.8 1"
     return (
-        f'<body name="{name}" pos="{at}"><joint name="{name}" {joint}/><geom name="{name}" {geom}/>'
-        "</body>"
+        f'<body name="{name}" pos="{at}"><joint name="{name}" {joint}/>'
+        f'<geom name="{name}" rgba="{color}" {geom}/></body>'
     )
 
 
@@ -368,18 +369,22 @@ conaffinity="0"/></body>"""
 
 
 def _pushing(law: str, k: Floats) -> str:
-    shape, slide = 'size="0.05 0.05 0.05" mass="0.5" friction="0.3"', 'type="slide" axis'
+    shape, slide = 'type="box" size="0.05 0.05 0.05" mass="0.5"', 'type="slide" axis'
     ways = {"x": f'{slide}="1 0 0"', "y": f'{slide}="0 1 0"', "z": f'{slide}="0 0 1"'}
     ways["turn"] = 'axis="0 0 1"'  # a block on the floor, which cannot tip over
     blocks = "".join(
-        f'<body name="{name}" pos="{x:.4f} {y} 0.05"><geom name="{name}" type="box" {shape}/>'
+        f'<body name="{name}" pos="{x:.4f} {y} 0.05"><geom name="{name}" {shape} friction="0.3" '
+        f'rgba="{color}"/>'
         + "".join(f'<joint name="{name}_{way}" {joint}/>' for way, joint in ways.items())
         + "</body>"
-        for name, x, y in (("block", 0.0, 0.0), ("other", 0.3 * k[0], 0.07))
+        for name, x, y, color in (
+            ("block", 0.0, 0.0, "0.2 0.4 0.8 1"),
+            ("other", 0.3 * k[0], 0.07, "0.2 0.6 0.3 1"),
+        )
     )
     pusher = f"""<body name="pusher" pos="-0.3 0 0.05"><joint name="pusher" {SLIDE}
 {_laws(law, k, 0.0, 0.5)}/><joint name="offset" axis="0 1 0" type="slide" damping="100"/>
-<geom name="pusher" type="sphere" size="0.04" mass="0.5" friction="0.3"/></body>"""
+<geom name="pusher" rgba="0.8 0.3 0.2 1" size="0.04" mass="0.5" friction="0.3"/></body>"""
     floor = '<geom name="floor" type="plane" size="3 3 0.1" friction="0"/>'
     return _model(0.005, floor + pusher + blocks, gravity="0 0 -9.81")
 
