@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -16,7 +17,8 @@ from scm_world import lab
 from scm_world.errors import ScmWorldError
 from scm_world.lab.agents import _confounded
 from scm_world.lab.expressions import evaluate
-from scm_world.lab.questions import build
+from scm_world.lab.questions import LevelView, build
+from scm_world.lab.worlds import RIGS, testbed
 
 
 def test_a_question_is_answered_by_the_solver_and_by_no_trivial_answer() -> None:
@@ -223,3 +225,29 @@ def test_the_command_runs_replays_and_plays(tmp_path: Path) -> None:
     assert '"brier"' in played.output
     assert "counterfactual" in run.invoke(app, ["lab", "list"]).output
     assert run.invoke(app, ["lab", "replay"]).exit_code == 2
+
+
+def test_a_strike_moves_the_block_as_in_plain_mujoco() -> None:
+    """The mean under an intervention is what the engine gives for these numbers."""
+    rng, names = np.random.default_rng(3), [*RIGS["pushing"].causes]
+    view = LevelView(testbed("pushing", rng, lab.Knobs()), "L2", lab.Knobs(), 3)
+    do = {name: 0.3 * view.ends(name)[0] + 0.7 * view.ends(name)[1] for name in names}
+    xml = RIGS["pushing"].xml("plain", np.random.default_rng(3).uniform(0.7, 1.4, 3))
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    for body in ("pusher", "block"):
+        model.body(body).mass = do[f"{body}.mass"]
+    model.geom("block").friction[0] = do["block.friction"]
+    model.joint("pusher").damping[0] = do["pusher.damping"]
+    data.joint("offset").qpos, data.joint("pusher").qvel = (
+        do["offset.position"],
+        do["pusher.velocity"],
+    )
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    mujoco.mj_step(model, data, nstep=240)
+    found = view.means({**do, "lamp0.brightness": 0.5})
+    assert data.joint("block_x").qpos > 0.03
+    for joint in ("block_x", "block_turn"):
+        assert found[f"{joint}.position.final"] == pytest.approx(
+            float(data.joint(joint).qpos[0]), abs=1e-9
+        )
