@@ -18,7 +18,7 @@ from scm_world.discovery.metrics import evaluate as evaluate_graph
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.lab.expressions import FORM, evaluate
 from scm_world.lab.worlds import RIGS, WORLDS, Knobs, Testbed, testbed
-from scm_world.queries import Laboratory
+from scm_world.queries import Episode, Laboratory, Plan
 from scm_world.variables import Box, Draw, Hard
 
 LEVELS: Mapping[str, str] = {
@@ -138,6 +138,13 @@ class LevelView:
         first = room.spent
         samples = room.do(self.plan(do, at), n) if do else room.see(n)
         return self.noisy(self._table(samples), first)
+
+    def episode(self, do: Mapping[str, Any], at: int, unit: int) -> Episode:
+        """Repeat an episode of the agent, by its number."""
+        setting = dict(self.testbed.setting)
+        plan = Plan(self.plan(do, at)).over(setting.pop("nature", None), "nature")
+        seed = self.entropy % 2**62
+        return self.testbed.world.rollout(do=plan, seed=seed, episode=unit, **setting)
 
     def noisy(self, table: dict[str, Floats], first: int) -> dict[str, Floats]:
         """Add the noise of readings; that of an episode depends on its number only."""
