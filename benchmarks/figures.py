@@ -556,7 +556,6 @@ PICTURES: Mapping[str, Callable[[], Any]] = {
     "causes": causes,
     "randomisation": randomisation,
     "real": real,
-    "lab": laboratories,
 }
 
 
