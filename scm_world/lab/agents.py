@@ -14,7 +14,7 @@ from scm_world._arguments import one_of
 from scm_world._types import Floats
 from scm_world.lab.expressions import evaluate
 from scm_world.lab.laboratory import ROWS, Laboratory
-from scm_world.lab.questions import Question
+from scm_world.lab.questions import PASSED, Question
 
 Columns = Mapping[str, Floats]
 
@@ -309,13 +309,15 @@ def trivial(question: Question) -> dict[str, Any]:
 
 
 def certify(question: Question) -> dict[str, Any]:
-    """Return the scores of the solver and of the trivial answers."""
+    """Return the scores of the solver and, if it passes, those of the trivial answers."""
     room = Laboratory(question)
     ideal(room)
     assert room.score is not None  # noqa: S101 # it has submitted
+    if room.score["score"] < PASSED:
+        return {"solver": room.score["score"], "trivial": {}}
     found = {name: question.grade(answer) for name, answer in trivial(question).items()}
     if not found:
-        found = {"guess": 1.0 / len(question.query["usual"])}
+        found = {"most frequent name": 1.0 / len(question.view.testbed.causes)}
     return {"solver": room.score["score"], "trivial": found}
 
 

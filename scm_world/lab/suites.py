@@ -18,7 +18,7 @@ from functools import partial
 from importlib import metadata, resources
 from typing import TYPE_CHECKING, Any, NamedTuple, cast, final
 
-from scm_world._arguments import one_of, typed
+from scm_world._arguments import one_of, real_number, typed
 from scm_world.discovery.data import Dataset, as_frame, as_huggingface, collect, load, save
 from scm_world.discovery.problems import TaskView, problem
 from scm_world.errors import ModelError, ScmWorldError, UnknownOption, reading
@@ -212,7 +212,8 @@ class Suite:
             the best mean score of a trivial answer.
 
         Raises:
-            UnknownOption: A column is missing, an id is not of this suite, or two rows have one.
+            UnknownOption: A column is missing, an id is not of this suite, two rows have one, or a
+                confidence is no number in [0, 1].
         """
         import pandas
 
@@ -443,6 +444,8 @@ def _frame(path: Location) -> pandas.DataFrame:
 
 def _answers(table: pandas.DataFrame, known: set[str]) -> dict[str, tuple[Any, Any]]:
     """Return the answer and the confidence by the id of their question."""
+    import pandas
+
     for column in (ID, ANSWER):
         one_of("column of answers", column, [*table])
     found = dict[str, tuple[Any, Any]]()
@@ -451,11 +454,13 @@ def _answers(table: pandas.DataFrame, known: set[str]) -> dict[str, tuple[Any, A
         one_of("question", i, sorted(known))
         if i in found:
             raise UnknownOption("question", i, ("one row for each question",))
+        if known_sure := not pandas.isna(confidence):
+            real_number(f"confidence of question {i}", confidence, least=0.0, most=1.0)
         answer = given
         if isinstance(given, str):
             with suppress(ValueError):  # a law or a name without quotes
                 answer = json.loads(given)
-        found[i] = answer, confidence
+        found[i] = answer, float(confidence) if known_sure else None
     return found
 
 
@@ -487,12 +492,6 @@ def _overlap(answer: Any, about: Mapping[str, Any]) -> float:
     found |= {frozenset(pair) for pair in graph_pairs(answer, "hidden", about["names"])}
     true = {*map(tuple, about["edges"]), *map(frozenset, about["hidden"])}
     return 2.0 * len(found & true) / max(len(found) + len(true), 1)
-
-
-def _brier(confidence: Any, score: float | None) -> float | None:
-    if confidence is None or score is None or not 0.0 <= confidence <= 1.0:
-        return None
-    return brier(confidence, score)
 
 
 def _summary(rows: pandas.DataFrame) -> pandas.DataFrame:

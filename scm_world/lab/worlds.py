@@ -93,6 +93,12 @@ class Testbed:
         return tuple(one for one in self.quantities if one.sets)
 
     @property
+    def causes(self) -> tuple[str, ...]:
+        """The names of the settable quantities that act on something."""
+        acting = {cause for cause, _ in (*self.edges, *self.own)}
+        return tuple(one.name for one in self.settable if one.name in acting)
+
+    @property
     def outcomes(self) -> tuple[LabVariable, ...]:
         """The quantities that are read; those alone that cannot be set, if there are any."""
         read = tuple(one for one in self.quantities if one.reads)
@@ -375,6 +381,7 @@ RIGS: Mapping[str, Rig] = {
             **{f"{side}.mass": MASS for side in ("left", "right")},
             "spring.stiffness": ("N/m", 1.0, 9.0),
             **{f"{side}.velocity": SPEED for side in ("left", "right")},
+            "left.position": ("m", -0.3, 0.3),
         },
         {"left.position": "m", "right.position": "m"},
         1.2,
@@ -387,6 +394,7 @@ RIGS: Mapping[str, Rig] = {
             "beam.stiffness": ("N m/rad", 4.0, 12.0),
             "beam.damping": ("N m s/rad", 0.2, 2.0),
             "beam.velocity": ("rad/s", -2.0, 2.0),
+            "beam.position": ("rad", -0.3, 0.3),
         },
         {"beam.position": "rad", "beam.velocity": "rad/s"},
         1.0,
@@ -397,6 +405,7 @@ RIGS: Mapping[str, Rig] = {
         {
             **{f"{box}.mass": MASS for box in ("first", "second")},
             "first.velocity": ("m/s", 0.3, 2.5),
+            "second.velocity": ("m/s", -0.5, 0.5),
             **{f"{box}.damping": ("N s/m", 0.1, 1.5) for box in ("first", "second")},
         },
         {"first.position": "m", "second.position": "m"},
@@ -411,6 +420,7 @@ RIGS: Mapping[str, Rig] = {
             "across.velocity": ("m/s", -0.6, 0.6),
             "down.velocity": ("m/s", -1.0, 1.0),
             "across.damping": ("N s/m", 0.0, 1.0),
+            "down.damping": ("N s/m", 0.0, 2.0),
         },
         {"across.position": "m", "down.position": "m"},
         0.6,
@@ -424,6 +434,7 @@ RIGS: Mapping[str, Rig] = {
             "cart.damping": ("N s/m", 0.1, 4.0),
             "pole.position": ("rad", -0.25, 0.25),
             "cart.velocity": ("m/s", -0.6, 0.6),
+            "pole.velocity": ("rad/s", -0.5, 0.5),
         },
         {"cart.position": "m", "pole.position": "rad"},
         1.2,
@@ -499,7 +510,7 @@ def rig(made: Rig, rng: np.random.Generator, knobs: Knobs) -> Testbed:
         World(task).given(follows),
         tuple(quantities),
         {"policy": None, "steps": made.steps},
-        64,
+        128,
         f"{made.doc} {LAWS[knobs.law].capitalize()}.",
         edges=tuple((cause, f"{what}.{how}") for cause in made.causes for what, how in outcomes),
     )
