@@ -18,7 +18,7 @@ from scm_world.discovery.metrics import evaluate as evaluate_graph
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.lab.expressions import FORM, evaluate
 from scm_world.lab.worlds import RIGS, WORLDS, Knobs, Testbed, testbed
-from scm_world.queries import Laboratory
+from scm_world.queries import Episode, Laboratory, Plan
 from scm_world.variables import Box, Draw, Hard
 
 LEVELS: Mapping[str, str] = {
@@ -149,6 +149,13 @@ class LevelView:
             name: column + self.spread[name] * drawn[:, i]
             for i, (name, column) in enumerate(table.items())
         }
+
+    def episode(self, do: Mapping[str, Any], at: int, unit: int) -> Episode:
+        """Repeat an episode of the agent, by its number."""
+        setting = dict(self.testbed.setting)
+        plan = Plan(self.plan(do, at)).over(setting.pop("nature", None), "nature")
+        seed = self.entropy % 2**62
+        return self.testbed.world.rollout(do=plan, seed=seed, episode=unit, **setting)
 
     # --- answers --------------------------------------------------------------------------------
 

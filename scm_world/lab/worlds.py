@@ -309,9 +309,10 @@ def _laws(law: str, k: Floats, stiffness: float, damping: float) -> str:
 
 
 def _body(name: str, at: str, joint: str, geom: str) -> str:
+    color = "0.8 0.3 0.2 1" if name in ("left", "first") else "0.2 0.4 0.8 1"
     return (
-        f'<body name="{name}" pos="{at}"><joint name="{name}" {joint}/><geom name="{name}" {geom}/>'
-        "</body>"
+        f'<body name="{name}" pos="{at}"><joint name="{name}" {joint}/>'
+        f'<geom name="{name}" rgba="{color}" {geom}/></body>'
     )
 
 
@@ -373,6 +374,27 @@ conaffinity="0"/></body>"""
     return _model(0.01, body.replace("</body>", f"{pole}</body>"), motor, "0 0 -9.81")
 
 
+def _pushing(law: str, k: Floats) -> str:
+    shape, slide = 'type="box" size="0.05 0.05 0.05" mass="0.5"', 'type="slide" axis'
+    ways = {"x": f'{slide}="1 0 0"', "y": f'{slide}="0 1 0"', "z": f'{slide}="0 0 1"'}
+    ways["turn"] = 'axis="0 0 1"'  # a block on the floor, which cannot tip over
+    blocks = "".join(
+        f'<body name="{name}" pos="{x:.4f} {y} 0.05"><geom name="{name}" {shape} friction="0.3" '
+        f'rgba="{color}"/>'
+        + "".join(f'<joint name="{name}_{way}" {joint}/>' for way, joint in ways.items())
+        + "</body>"
+        for name, x, y, color in (
+            ("block", 0.0, 0.0, "0.2 0.4 0.8 1"),
+            ("other", 0.3 * k[0], 0.07, "0.2 0.6 0.3 1"),
+        )
+    )
+    pusher = f"""<body name="pusher" pos="-0.3 0 0.05"><joint name="pusher" {SLIDE}
+{_laws(law, k, 0.0, 0.5)}/><joint name="offset" axis="0 1 0" type="slide" damping="100"/>
+<geom name="pusher" rgba="0.8 0.3 0.2 1" size="0.04" mass="0.5" friction="0.3"/></body>"""
+    floor = '<geom name="floor" type="plane" size="3 3 0.1" friction="0"/>'
+    return _model(0.005, floor + pusher + blocks, gravity="0 0 -9.81")
+
+
 MASS, SPEED = ("kg", 0.2, 1.5), ("m/s", 0.3, 2.0)
 RIGS: Mapping[str, Rig] = {
     "springs": Rig(
@@ -425,6 +447,19 @@ RIGS: Mapping[str, Rig] = {
         {"across.position": "m", "down.position": "m"},
         0.6,
         "A ball falls into a funnel.",
+    ),
+    "pushing": Rig(
+        _pushing,
+        {
+            **{f"{body}.mass": ("kg", 0.4, 1.2) for body in ("pusher", "block")},
+            "block.friction": ("1", 0.2, 0.6),
+            "pusher.velocity": ("m/s", 1.5, 3.0),
+            "offset.position": ("m", 0.01, 0.035),
+            "pusher.damping": ("N s/m", 0.1, 3.0),
+        },
+        {"block_x.position": "m", "block_turn.position": "rad"},
+        1.2,
+        "A pusher strikes a block on the floor, off its middle; it slides, and may hit another.",
     ),
     "cartpole": Rig(
         _cartpole,

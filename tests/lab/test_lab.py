@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import subprocess
 import sys
+import zlib
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -16,7 +19,8 @@ from scm_world import lab
 from scm_world.errors import ScmWorldError
 from scm_world.lab.agents import _confounded
 from scm_world.lab.expressions import evaluate
-from scm_world.lab.questions import build
+from scm_world.lab.questions import LevelView, build
+from scm_world.lab.worlds import RIGS, testbed
 
 
 def test_a_question_is_answered_by_the_solver_and_by_no_trivial_answer() -> None:
@@ -71,6 +75,7 @@ HOSTILE: tuple[tuple[str, Any], ...] = (
     ("submit", {"answer": "1", "confidence": float("nan")}),
     ("submit", {"answer": 1.0, "confidence": 0.5}),
     ("submit", {"answer": ["1"] * 10**5, "confidence": 0.5}),
+    ("look", {"episode": 0}),
     ("note", {"text": "x" * 10**6}),
     ("note", {"text": 3}),
     ("__init__", {"question": None}),
@@ -223,3 +228,59 @@ def test_the_command_runs_replays_and_plays(tmp_path: Path) -> None:
     assert '"brier"' in played.output
     assert "counterfactual" in run.invoke(app, ["lab", "list"]).output
     assert run.invoke(app, ["lab", "replay"]).exit_code == 2
+
+
+def test_a_strike_moves_the_block_as_in_plain_mujoco() -> None:
+    """The mean under an intervention is what the engine gives for these numbers."""
+    rng, names = np.random.default_rng(3), [*RIGS["pushing"].causes]
+    view = LevelView(testbed("pushing", rng, lab.Knobs()), "L2", lab.Knobs(), 3)
+    do = {name: 0.3 * view.ends(name)[0] + 0.7 * view.ends(name)[1] for name in names}
+    xml = RIGS["pushing"].xml("plain", np.random.default_rng(3).uniform(0.7, 1.4, 3))
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    for body in ("pusher", "block"):
+        model.body(body).mass = do[f"{body}.mass"]
+    model.geom("block").friction[0] = do["block.friction"]
+    model.joint("pusher").damping[0] = do["pusher.damping"]
+    data.joint("offset").qpos, data.joint("pusher").qvel = (
+        do["offset.position"],
+        do["pusher.velocity"],
+    )
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    mujoco.mj_step(model, data, nstep=240)
+    found = view.means({**do, "lamp0.brightness": 0.5})
+    assert data.joint("block_x").qpos > 0.03
+    for joint in ("block_x", "block_turn"):
+        assert found[f"{joint}.position.final"] == pytest.approx(
+            float(data.joint(joint).qpos[0]), abs=1e-9
+        )
+
+
+def test_an_episode_that_was_run_is_looked_at_and_it_is_the_same_episode() -> None:
+    """Its readings are repeated, the red box goes to the right, and masked levels are refused."""
+    asked = build("effect", "boxes", 1, "L2", lab.Knobs(noise=0.0, selection=True), 0, None)
+    room = lab.Laboratory(asked)
+    refused = room.call("look", {"episode": 0})
+    assert "before any was run" in refused["refused"]
+    rows = len(room.observe(6)["columns"]["first.position.final"])
+    far = room.experiment({"first.velocity": 2.4}, n=2)["columns"]
+    assert rows < 6  # those that are not shown have no number
+    assert "refused" in room.call("look", {"episode": rows + 2})
+    assert "refused" in room.call("look", {"episode": 0, "frames": 9})
+    again = asked.view.fresh().episode({"first.velocity": 2.4}, 0, 7)
+    for name in ("first", "second"):
+        assert again.final(f"{name}.position") == far[f"{name}.position.final"][1]
+    seen = room.look(rows + 1)
+    assert room.spent == 8
+    assert seen["steps"] == [0, 2, 4]
+    places = []
+    for one in seen["pictures"]:
+        data = base64.b64decode(one)
+        assert data[:8] == b"\x89PNG\r\n\x1a\n"
+        pixels = np.frombuffer(zlib.decompress(data[41:-16]), np.uint8).reshape(240, -1)[:, 1:]
+        red = pixels.reshape(240, 320, 3).astype(int)
+        places.append(np.nonzero(red[..., 0] > red[..., 2] + 50)[1].mean())
+    assert places[0] < places[1] < places[2]
+    masked = lab.Laboratory(build("effect", "boxes", 1, "L3", lab.Knobs(), 0, None))
+    masked.observe()
+    assert "level L3" in masked.call("look", {"episode": 0})["refused"]
