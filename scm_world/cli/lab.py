@@ -116,7 +116,9 @@ def _finish(room: Laboratory, out: str | None) -> None:
         console.say(f"written: {room.save(Path(out))}", stderr=True)
 
 
-def replay(file: Annotated[str, typer.Argument(metavar="FILE")], *, key: options.Key = None) -> None:
+def replay(
+    file: Annotated[str, typer.Argument(metavar="FILE")], *, key: options.Key = None
+) -> None:
     """Repeat a saved run, and say what differs; the exit code is then 1.
 
     Example: scm-world lab replay run.json

@@ -226,6 +226,13 @@ def test_the_command_runs_replays_and_plays(tmp_path: Path) -> None:
     assert played.exit_code == 0, played.output
     assert "not JSON" in played.output
     assert '"brier"' in played.output
+    (secret := tmp_path / "key.txt").write_text("a secret of a test\n")
+    asked = ["lab", "run", "--seed", "3", "--out", path]
+    private = run.invoke(app, [*asked, "--key", str(secret)])
+    assert private.exit_code == 0, private.output
+    in_room = {"SCM_LAB_KEY": "a secret of a test"}
+    assert "identical" in run.invoke(app, ["lab", "replay", path], env=in_room).output
+    assert run.invoke(app, ["lab", "replay", path]).exit_code == 1
     assert "counterfactual" in run.invoke(app, ["lab", "list"]).output
     assert run.invoke(app, ["lab", "replay"]).exit_code == 2
 
