@@ -58,7 +58,7 @@ class LevelView:
     """
 
     def __init__(
-        self, testbed: Testbed, level: str, knobs: Knobs, entropy: int, lot: float
+        self, testbed: Testbed, level: str, knobs: Knobs, entropy: int, lot: float = 0.0
     ) -> None:
         self.testbed, self.level, self.knobs, self.entropy = testbed, level, knobs, entropy
         self.lot = lot
@@ -647,7 +647,7 @@ def build(
 ) -> Question:
     """Build a draw of a question, which is not certified.
 
-    Its random numbers follow from an HMAC-SHA256 of kind, world, seed, knobs and draw under the
+    Its random numbers follow from an HMAC-SHA256 of kind, world, seed, draw and knobs under the
     key, so that nobody without the key can make it.
     """
     is_file = kind != "graph" and isinstance(world, str) and world.endswith(FILES)
@@ -656,13 +656,13 @@ def build(
     one_of("level", level, tuple(LEVELS))
     seed, draw = whole_number("seed", seed, least=0), whole_number("draw", draw, least=0)
     check_key(key)
-    secret, same = (key or "").encode(), [kind, world, seed, asdict(knobs)]
+    secret, same, hard = (key or "").encode(), (kind, world, seed), asdict(knobs)
 
     def hashed(*parts: Any) -> int:
         found = hmac.new(secret, json.dumps(parts).encode(), hashlib.sha256)
         return int.from_bytes(found.digest()[:7], "big")
 
-    entropy, lot = hashed(*same, draw), hashed(*same) / 256**7
+    entropy, lot = hashed(*same, draw, hard), hashed(*same, hard) / 256**7
     rng = np.random.default_rng([entropy, 0])
     view = LevelView(testbed(world, rng, knobs), level, knobs, entropy, lot)
     seal = hmac.new(secret, b"digest", hashlib.sha256).digest()
