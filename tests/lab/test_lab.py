@@ -17,6 +17,7 @@ import pytest
 
 from scm_world import lab
 from scm_world.errors import ScmWorldError
+from scm_world.lab import worlds
 from scm_world.lab.agents import _confounded
 from scm_world.lab.expressions import evaluate
 from scm_world.lab.questions import LevelView, build
@@ -284,3 +285,41 @@ def test_an_episode_that_was_run_is_looked_at_and_it_is_the_same_episode() -> No
     masked = lab.Laboratory(build("effect", "boxes", 1, "L3", lab.Knobs(), 0, None))
     masked.observe()
     assert "level L3" in masked.call("look", {"episode": 0})["refused"]
+
+
+def test_speeds_act_on_other_boxes_where_plain_mujoco_says_so_and_only_by_contact(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Finite differences of the engine around the run have the same edges; without contact none."""
+    files, real = list[str](), worlds._model
+    monkeypatch.setattr(worlds, "_model", lambda *of: files.append(real(*of)) or files[-1])
+    asked = build("graph", "row", 6, "L2", lab.Knobs(), 1, None)
+    given = {name: value for name, value in asked.query["set"].items() if "box" in name}
+
+    def final(speeds: dict[str, float], *, contact: bool) -> dict[str, float]:
+        model = mujoco.MjModel.from_xml_string(files[-1])
+        if not contact:
+            model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+        data = mujoco.MjData(model)
+        for name, value in speeds.items():
+            data.joint(name.partition(".")[0]).qvel = value
+        mujoco.mj_step(model, data, nstep=240)
+        return {name: float(data.joint(name.partition(".")[0]).qpos[0]) for name in speeds}
+
+    def edges(*, contact: bool) -> list[list[str]]:
+        found = []
+        for cause, value in given.items():
+            low, high = (
+                final({**given, cause: value + apart}, contact=contact) for apart in (-0.02, 0.02)
+            )
+            found += [
+                [cause, name.replace("velocity", "position.final")]
+                for name in given
+                if name != cause and abs(high[name] - low[name]) > 1e-9
+            ]
+        return sorted(found)
+
+    assert len(asked.answer["edges"]) == 5  # one pair in one direction only
+    assert edges(contact=True) == asked.answer["edges"]
+    assert edges(contact=False) == []
+    assert asked.grade({"edges": asked.answer["edges"]}) == 1.0
