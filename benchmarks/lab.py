@@ -6,6 +6,8 @@
     python -m benchmarks.lab truth             # their answers, by an independent script
     python -m benchmarks.lab names             # the most frequent answers that are names
     python -m benchmarks.lab suites --made DIR # the manifests, with the hashes of made folders
+    python -m benchmarks.lab curves            # scores of agents by budget; ten minutes, resumable
+    python -m benchmarks.lab trained           # PPO on experiments, beside two simple agents
 
 The figures are in ``lab.json``. Questions are those of ``lab-1``, in the order of its parts.
 """
@@ -14,20 +16,23 @@ from __future__ import annotations
 
 import argparse
 import json
+import runpy
 import time
 from collections import Counter, defaultdict
 from contextlib import suppress
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks import as_json
+from benchmarks import as_json, figures
 from benchmarks.lab_truth import confirm
 from scm_world import lab
 from scm_world.discovery.data import load
 from scm_world.discovery.learners.registry import learn
+from scm_world.evaluation.statistics import mean_interval
 from scm_world.lab import suites
 from scm_world.lab.questions import Question, Unusable, build
 from scm_world.runs.pool import Pool
@@ -171,6 +176,95 @@ def names() -> dict[str, dict[str, dict[str, int]]]:
     return found
 
 
+# --- agents ---------------------------------------------------------------------------------------
+
+SHARES = (0.25, 0.5, 1.0, 2.0)
+EACH = 3
+"""Questions of each kind and level."""
+
+
+def budgeted(question: Question, share: float) -> Question:
+    """Return the same question with a share of its budget."""
+    view = question.view.fresh()
+    view.testbed = replace(view.testbed, budget=round(share * question.budget))
+    return replace(question, view=view)
+
+
+def curved(job: dict[str, Any]) -> dict[str, Any]:
+    """Return the scores of all agents on a question, by budget."""
+    spec = {name: job[name] for name in ("kind", "world", "seed", "level")}
+    try:
+        made = lab.question(**spec, **job["knobs"])
+    except Unusable as error:
+        return {**job, "error": str(error)[:200]}
+    played = {
+        agent: [lab.play(agent, budgeted(made, share)).score or {} for share in SHARES]
+        for agent in lab.AGENTS
+    }
+    found = {agent: [one["score"] for one in ones] for agent, ones in played.items()}
+    return {**job, "scores": found, "trivial": max((made.certificate or {})["trivial"].values())}
+
+
+def curves(out: Path, workers: int) -> dict[str, Any]:
+    """Play questions of ``lab-1`` that are not of servos; continue with the same file.
+
+    Levels begin one after another in the list of worlds, so that all worlds have their turn. The
+    first three are left out: the agents were written with some of them.
+    """
+    wanted = list[dict[str, Any]]()
+    for number, level in enumerate(lab.LEVELS, 1):
+        for kind in lab.KINDS:
+            every = suites._specs(recipes()[f"{kind}-{level}"])[EACH * number :]
+            wanted += [job for job in every if job["world"] != "servo"][:EACH]
+    rows = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
+    known = [{name: row[name] for name in wanted[0]} for row in rows]
+    with Pool("process" if workers > 1 else None, workers) as pool, out.open("a") as file:
+        for _, row in pool.run(curved, [job for job in wanted if job not in known]):
+            rows.append(row)
+            file.write(json.dumps(row) + "\n")
+            file.flush()
+    return averaged([row for row in rows if {n: row[n] for n in wanted[0]} in wanted])
+
+
+def averaged(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return mean scores with intervals over questions: by kind, by level, and of all."""
+    good = [row for row in rows if "scores" in row]
+
+    def means(values: Any, **more: Any) -> list[dict[str, float]]:
+        each = [mean_interval(column, **more) for column in np.transpose(values)]
+        return [{"value": o.value, "low": o.low, "high": o.high} for o in each]
+
+    found: dict[str, Any] = {"shares": SHARES, "seeds without a question": len(rows) - len(good)}
+    for name in (*lab.KINDS, *lab.LEVELS, "all"):
+        some = [row for row in good if name in (row["kind"], row["level"], "all")]
+        of = {agent: np.array([row["scores"][agent] for row in some]) for agent in lab.AGENTS}
+        found[name] = {
+            "questions": len(some),
+            "agents": {agent: means(score, proportion=True) for agent, score in of.items()},
+            "best trivial answer": means([[row["trivial"]] for row in some], proportion=True)[0],
+            "minus random": {
+                agent: means(of[agent] - of["random"], proportion=False)
+                for agent in of
+                if agent != "random"
+            },
+        }
+    return found
+
+
+def trained(steps: int) -> dict[str, Any]:
+    """Train PPO to choose experiments, and compare it on questions that it has not seen."""
+    compare = runpy.run_path(str(HERE.parent / "examples" / "lab_agents.py"))["compare"]
+    begin = time.process_time()
+    found = {name: np.array(scores) for name, scores in compare(steps).items()}
+    minus = {
+        f"trained minus {name}": mean_interval(found["trained"] - found[name], proportion=False)
+        for name in ("random", "information")
+    }
+    every = {name: mean_interval(one, proportion=True) for name, one in found.items()} | minus
+    rows = {name: {"value": o.value, "low": o.low, "high": o.high} for name, o in every.items()}
+    return {"steps": steps, "CPU seconds": round(time.process_time() - begin), **rows}
+
+
 # --- manifests ------------------------------------------------------------------------------------
 
 
@@ -247,15 +341,27 @@ def manifests(made: dict[str, Path]) -> None:
         (MANIFESTS / f"{name}.json").write_text(text + "\n")
 
 
+PARTS = ("questions", "truth", "names", "suites", "curves", "trained")
+
+
 def main() -> None:
     """Run one part."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("part", choices=("questions", "truth", "names", "suites"))
+    parser.add_argument("part", choices=PARTS)
     parser.add_argument("--n", type=int, default=25)
     parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--rows", type=Path, default=HERE / "lab_questions.jsonl")
+    parser.add_argument("--rows", type=Path)
+    parser.add_argument("--steps", type=int, default=60_000)
     parser.add_argument("--made", type=Path, nargs="*", default=[])
     given = parser.parse_args()
+    part = "curves" if given.part == "curves" else "questions"
+    given.rows = given.rows or HERE / f"lab_{part}.jsonl"
+    known = json.loads(RESULTS.read_text())
+    if given.part in ("curves", "trained"):
+        one = trained(given.steps) if given.part == "trained" else curves(given.rows, given.workers)
+        RESULTS.write_text(as_json({**known, given.part: one}) + "\n")
+    if given.part == "curves":
+        figures.main(["lab"])
     if given.part == "questions":
         questions(given.n, given.workers, given.rows)
     if given.part == "truth":
@@ -266,10 +372,8 @@ def main() -> None:
                 outcome = confirm(Question.of(row["spec"]))["confirmed"]
                 count = found[row["spec"]["kind"]].setdefault("confirmed", {})
                 count[str(outcome)] = count.get(str(outcome), 0) + 1
-        known = json.loads(RESULTS.read_text())
         RESULTS.write_text(as_json({**known, "questions": found}) + "\n")
     if given.part == "names":
-        known = json.loads(RESULTS.read_text())
         RESULTS.write_text(as_json({**known, "names": names()}) + "\n")
     if given.part == "suites":
         manifests({path.name: path for path in given.made})

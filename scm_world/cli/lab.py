@@ -80,7 +80,7 @@ def run(asked: QuestionOptions, *, agent: str = "random", out: options.Text = No
     Example: scm-world lab run --kind effect --world springs --seed 3 --agent random
 
     Args:
-        agent: random or ideal.
+        agent: random, one-at-a-time, pairs, do_order, information or ideal.
         out: File of the run, for scm-world lab replay.
     """
     from scm_world import lab
