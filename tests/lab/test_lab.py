@@ -21,7 +21,6 @@ from scm_world.lab import worlds
 from scm_world.lab.agents import DESIGNS, ROUNDS, _confounded, _Known, _Seen
 from scm_world.lab.expressions import evaluate
 from scm_world.lab.questions import LevelView, build
-from scm_world.lab.worlds import RIGS, testbed
 
 
 def test_a_question_is_answered_by_the_solver_and_by_no_trivial_answer() -> None:
@@ -271,10 +270,10 @@ def test_the_command_runs_replays_and_plays(tmp_path: Path) -> None:
 
 def test_a_strike_moves_the_block_as_in_plain_mujoco() -> None:
     """The mean under an intervention is what the engine gives for these numbers."""
-    rng, names = np.random.default_rng(3), [*RIGS["pushing"].causes]
-    view = LevelView(testbed("pushing", rng, lab.Knobs()), "L2", lab.Knobs(), 3)
+    rng, names = np.random.default_rng(3), [*worlds.RIGS["pushing"].causes]
+    view = LevelView(worlds.testbed("pushing", rng, lab.Knobs()), "L2", lab.Knobs(), 3)
     do = {name: 0.3 * view.ends(name)[0] + 0.7 * view.ends(name)[1] for name in names}
-    xml = RIGS["pushing"].xml("plain", np.random.default_rng(3).uniform(0.7, 1.4, 3))
+    xml = worlds.RIGS["pushing"].xml("plain", np.random.default_rng(3).uniform(0.7, 1.4, 3))
     model = mujoco.MjModel.from_xml_string(xml)
     data = mujoco.MjData(model)
     for body in ("pusher", "block"):
