@@ -17,7 +17,7 @@ from scm_world._types import Floats
 from scm_world.discovery.metrics import evaluate as evaluate_graph
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.lab.expressions import FORM, evaluate
-from scm_world.lab.worlds import RIGS, WORLDS, Knobs, Testbed, testbed
+from scm_world.lab.worlds import RIGS, WORLDS, Knobs, Testbed, acted, testbed
 from scm_world.queries import Episode, Laboratory, Plan
 from scm_world.variables import Box, Draw, Hard
 
@@ -253,13 +253,25 @@ def _inside(view: LevelView, name: str, share: float) -> float:
 
 def _graph(view: LevelView, rng: np.random.Generator) -> Query:
     made, shown = view.testbed, view.names
-    edges = sorted([shown[c], shown[e]] for c, e in made.edges)
+    text = "Which variables act directly on which, and which pairs have a hidden common cause?"
+    true, query = made.edges, dict[str, Any]()
+    if made.local:
+        drawn = {name: _inside(view, name, rng.uniform(0.05, 0.95)) for name in _usual(view)}
+        true, query = acted(made, view.plan(drawn)), {"set": drawn}
+        for name, step in ((n, s) for n in drawn for s in (-0.04, 0.04)):
+            apart = {**drawn, name: drawn[name] + step * float(np.diff(view.ends(name))[0])}
+            if acted(made, view.plan(apart)) != true:
+                raise Unusable(["a small change makes or breaks a touch"])
+        text = (
+            "In a run all variables are set as below. Which of them acted on which outcomes in "
+            "this very run, so that an outcome were another if a variable was set slightly apart?"
+        )
+    edges = sorted([shown[c], shown[e]] for c, e in true)
     hidden = sorted(sorted((shown[a], shown[b])) for a, b in made.confounded)
     own = sorted([shown[c], shown[e]] for c, e in made.own)
     if not edges:
         raise Unusable(["no edge"])
-    text = "Which variables act directly on which, and which pairs have a hidden common cause?"
-    return Query(text, {"known": own}, {"edges": edges, "hidden": hidden})
+    return Query(text, {**query, "known": own}, {"edges": edges, "hidden": hidden})
 
 
 def _grade_graph(answer: Any, question: Question) -> float:
@@ -527,10 +539,10 @@ def offers(kind: str) -> tuple[str, ...]:
     """Return the worlds that have questions of a kind; model files have all but ``"graph"``."""
     one_of("kind", kind, tuple(KINDS))
     if kind == "graph":
-        return "equations", "servo", "network"
+        return "equations", "servo", "network", "row"
     if kind in ("explanation", "diagnosis"):
         return tuple(RIGS)
-    without = ("network", "boxes") if kind == "law" else ("network",)  # a touch is no expression
+    without = ("network", "row", *(("boxes",) if kind == "law" else ()))  # a touch is no expression
     return tuple(world for world in WORLDS if world not in without)
 
 
