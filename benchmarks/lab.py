@@ -4,7 +4,7 @@
 
     python -m benchmarks.lab questions --n 25  # of each kind: certificates and CPU time
     python -m benchmarks.lab truth             # their answers, by an independent script
-    python -m benchmarks.lab names             # the most frequent answers that are names
+    python -m benchmarks.lab names --n 40      # guesses by names, of seeds of each world
     python -m benchmarks.lab suites --made DIR # the manifests, with the hashes of made folders
     python -m benchmarks.lab curves            # scores of agents by budget; ten minutes, resumable
     python -m benchmarks.lab trained           # PPO on experiments, beside two simple agents
@@ -21,7 +21,6 @@ import time
 from collections import Counter, defaultdict
 from contextlib import suppress
 from dataclasses import replace
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -163,16 +162,69 @@ def table(rows: list[dict[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def names() -> dict[str, dict[str, dict[str, int]]]:
-    """Count answers that are names, of 16 draws of each rig that need not be certified."""
-    found = dict[str, dict[str, dict[str, int]]]()
-    for kind, world in product(("explanation", "diagnosis"), lab.offers("explanation")):
-        counts = Counter[str]()
-        for seed in range(1, 41):
+def named(rows: list[tuple[str, str]]) -> dict[str, Any]:
+    """Return how often the most frequent name of each world is right.
+
+    It is chosen on every other row and counted on the others, and the other way round, so that
+    chance does not raise it. The interval is that of Wilson.
+    """
+    right, counts = list[float](), defaultdict[str, Counter[str]](Counter)
+    for half in (0, 1):
+        often = defaultdict[str, Counter[str]](Counter)
+        for world, name in rows[half::2]:
+            often[world][name] += 1
+        right += [name == often[world].most_common(1)[0][0] for world, name in rows[1 - half :: 2]]
+    for world, name in rows:
+        counts[world][name] += 1
+    share = mean_interval(np.array(right, float), proportion=True)
+    return {
+        "questions": len(rows),
+        "most frequent name": [round(x, 3) for x in (share.value, share.low, share.high)],
+        "answers": {world: dict(of.most_common()) for world, of in counts.items()},
+    }
+
+
+def names(n: int) -> dict[str, Any]:
+    """Score guesses by names: of ``n`` seeds of each world, which need not be certified."""
+    found, typical = dict[str, Any](), list[list[float]]()
+
+    def first(kind: str, world: str, seed: int) -> Question:
+        for draw in range(40):
             with suppress(Unusable):
-                if counts.total() < 16:
-                    counts[build(kind, world, seed, "L2", lab.Knobs(), 0, None).answer] += 1
-        found.setdefault(kind, {})[world] = dict(counts.most_common())
+                return build(kind, world, seed, "L2", lab.Knobs(), draw, None)
+        raise Unusable([f"seed {seed}"])
+
+    for kind in ("explanation", "diagnosis"):
+        worlds = lab.offers(kind)
+        rows = [(world, first(kind, world, seed).answer) for seed in range(n) for world in worlds]
+        found[kind] = named(rows)
+    for world in lab.offers("effect"):
+        asked, same = [first("effect", world, seed) for seed in range(n)], defaultdict(list)
+        for one in asked:
+            same[one.query["cause"], one.query["outcome"]].append(one)
+        for many in (many for many in same.values() if len(many) > 1):
+            for one in many:
+                others = [other.answer for other in many if other is not one]
+                guess = float(np.median(others))
+                typical.append([guess * one.answer > 0.0, one.grade(guess)])
+    sign, score = np.mean(typical, axis=0)
+    found["effect"] = {
+        "questions": len(typical),
+        "sign of the median effect of the same names": round(float(sign), 3),
+        "score of that median": round(float(score), 3),
+    }
+    scores = defaultdict[str, list[float]](list)
+    for world in lab.offers("graph"):
+        for seed in range(n):
+            one = first("graph", world, seed)
+            causes = sorted(name for name, of in one.view.quantities.items() if of.sets)
+            read = sorted(n for n in one.view.readable if n not in causes) or causes
+            pairs = [[a, b] for i, a in enumerate(causes) for j, b in enumerate(read) if i != j]
+            chain = [[a, read[i + 1]] for i, a in enumerate(causes[:-1]) if i + 1 < len(read)]
+            forward = [[a, b] for a, b in pairs if a.split(".")[0] < b.split(".")[0]]
+            for name, edges in (("next in order", chain), ("earlier on later", forward)):
+                scores[name].append(one.grade({"edges": edges}))
+    found["graph"] = {name: round(float(np.mean(of)), 3) for name, of in scores.items()}
     return found
 
 
@@ -374,7 +426,7 @@ def main() -> None:
                 count[str(outcome)] = count.get(str(outcome), 0) + 1
         RESULTS.write_text(as_json({**known, "questions": found}) + "\n")
     if given.part == "names":
-        RESULTS.write_text(as_json({**known, "names": names()}) + "\n")
+        RESULTS.write_text(as_json({**known, "names": names(given.n)}) + "\n")
     if given.part == "suites":
         manifests({path.name: path for path in given.made})
 

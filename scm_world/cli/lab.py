@@ -18,8 +18,6 @@ from scm_world.cli import console, options
 if TYPE_CHECKING:
     from scm_world.lab import Laboratory, Question
 
-Key = Annotated[str | None, typer.Option(envvar="SCM_LAB_KEY")]
-
 
 @dataclass
 class QuestionOptions:
@@ -29,7 +27,6 @@ class QuestionOptions:
         kind: Kind of the question; see scm-world lab list.
         world: World of the question, or a model file.
         level: Prior knowledge, L1 to L4.
-        key: Secret of private questions.
         noise: Noise of readings, as a share of their spread.
         law: Law of springs and drag: plain, cubic, square or 'dead zone'.
     """
@@ -38,7 +35,7 @@ class QuestionOptions:
     world: str = "equations"
     seed: options.NotNegative = 0
     level: str = "L2"
-    key: Key = None
+    key: options.Key = None
     noise: options.Amount = 0.02
     law: str = "plain"
 
@@ -138,14 +135,15 @@ def _finish(room: Laboratory, out: str | None) -> None:
         console.say(f"written: {room.save(Path(out))}", stderr=True)
 
 
-def replay(file: Annotated[str, typer.Argument(metavar="FILE")], *, key: Key = None) -> None:
+def replay(
+    file: Annotated[str, typer.Argument(metavar="FILE")], *, key: options.Key = None
+) -> None:
     """Repeat a saved run, and say what differs; the exit code is then 1.
 
     Example: scm-world lab replay run.json
 
     Args:
         file: The file that scm-world lab run wrote.
-        key: Secret of a private question.
     """
     from scm_world import lab
 
@@ -162,7 +160,7 @@ def serve(
     level: str = "L2",
     n: options.N = 1,
     seed: options.NotNegative = 0,
-    key: Key = None,
+    key: options.Key = None,
     out: options.Text = None,
     mcp: bool = False,
     http: bool = False,
@@ -182,7 +180,6 @@ def serve(
         level: What agents know beforehand: L1, L2, L3 or L4.
         n: How many questions of each kind.
         seed: Seed of the first one; the others follow.
-        key: A secret, by which the questions are private.
         out: Folder in which every call is recorded. With the same folder a new server continues
             unfinished runs.
         mcp: Serve the Model Context Protocol; there is no other one.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from types import MappingProxyType
 from typing import Any, NamedTuple, final
@@ -73,6 +73,7 @@ class Testbed:
         edges: True edges between quantities, and pairs with a hidden common cause.
         confounded: Pairs with a hidden common cause.
         own: Edges that the question states.
+        local: Whether the graph is that of a given run, with edges that act only by contact.
         doc: What the world is, for the level L1.
     """
 
@@ -86,11 +87,18 @@ class Testbed:
     edges: tuple[Edge, ...] = ()
     confounded: tuple[Edge, ...] = ()
     own: tuple[Edge, ...] = ()
+    local: bool = False
 
     @property
     def settable(self) -> tuple[LabVariable, ...]:
         """The quantities that may be set."""
         return tuple(one for one in self.quantities if one.sets)
+
+    @property
+    def causes(self) -> tuple[str, ...]:
+        """The names of the settable quantities that act on something."""
+        acting = {cause for cause, _ in (*self.edges, *self.own)}
+        return tuple(one.name for one in self.settable if one.name in acting)
 
     @property
     def outcomes(self) -> tuple[LabVariable, ...]:
@@ -397,6 +405,7 @@ RIGS: Mapping[str, Rig] = {
             **{f"{side}.mass": MASS for side in ("left", "right")},
             "spring.stiffness": ("N/m", 1.0, 9.0),
             **{f"{side}.velocity": SPEED for side in ("left", "right")},
+            "left.position": ("m", -0.3, 0.3),
         },
         {"left.position": "m", "right.position": "m"},
         1.2,
@@ -409,6 +418,7 @@ RIGS: Mapping[str, Rig] = {
             "beam.stiffness": ("N m/rad", 4.0, 12.0),
             "beam.damping": ("N m s/rad", 0.2, 2.0),
             "beam.velocity": ("rad/s", -2.0, 2.0),
+            "beam.position": ("rad", -0.3, 0.3),
         },
         {"beam.position": "rad", "beam.velocity": "rad/s"},
         1.0,
@@ -419,6 +429,7 @@ RIGS: Mapping[str, Rig] = {
         {
             **{f"{box}.mass": MASS for box in ("first", "second")},
             "first.velocity": ("m/s", 0.3, 2.5),
+            "second.velocity": ("m/s", -0.5, 0.5),
             **{f"{box}.damping": ("N s/m", 0.1, 1.5) for box in ("first", "second")},
         },
         {"first.position": "m", "second.position": "m"},
@@ -433,6 +444,7 @@ RIGS: Mapping[str, Rig] = {
             "across.velocity": ("m/s", -0.6, 0.6),
             "down.velocity": ("m/s", -1.0, 1.0),
             "across.damping": ("N s/m", 0.0, 1.0),
+            "down.damping": ("N s/m", 0.0, 2.0),
         },
         {"across.position": "m", "down.position": "m"},
         0.6,
@@ -459,6 +471,7 @@ RIGS: Mapping[str, Rig] = {
             "cart.damping": ("N s/m", 0.1, 4.0),
             "pole.position": ("rad", -0.25, 0.25),
             "cart.velocity": ("m/s", -0.6, 0.6),
+            "pole.velocity": ("rad/s", -0.5, 0.5),
         },
         {"cart.position": "m", "pole.position": "rad"},
         1.2,
@@ -534,9 +547,57 @@ def rig(made: Rig, rng: np.random.Generator, knobs: Knobs) -> Testbed:
         World(task).given(follows),
         tuple(quantities),
         {"policy": None, "steps": made.steps},
-        64,
+        128,
         f"{made.doc} {LAWS[knobs.law].capitalize()}.",
         edges=tuple((cause, f"{what}.{how}") for cause in made.causes for what, how in outcomes),
+    )
+
+
+def row(rng: np.random.Generator, knobs: Knobs) -> Testbed:
+    """Make boxes on a rail, each with a speed; they act on one another only while they touch."""
+    n = max(4, knobs.variables - 1)
+    names = [f"box{i}" for i in rng.permutation(n)]
+    shape = 'type="box" size="0.05 0.05 0.05" friction="0" solref="0.03 0.5"'
+    gaps, masses = rng.uniform(0.15, 0.4, n), rng.uniform(0.4, 0.8, n)
+    bodies = "".join(
+        _body(name, f"{x:.4f} 0 0", f'{SLIDE} damping="0.3"', f'{shape} mass="{mass:.4f}"')
+        for name, x, mass in zip(names, np.cumsum(gaps), masses, strict=True)
+    )
+    made = Rig(
+        lambda _law, _k: _model(0.005, bodies),
+        {f"{name}.velocity": ("m/s", -1.2, 1.2) for name in sorted(names)},
+        dict.fromkeys((f"{name}.position" for name in sorted(names)), "m"),
+        1.2,
+        "Boxes slide on a rail; they act on one another only while they touch.",
+        24,
+    )
+    bed = rig(made, rng, replace(knobs, law="plain"))
+    kept = tuple(one for one in bed.quantities if not one.name.endswith((".mean", ".max")))
+    ends = {f"{name}.velocity": f"{name}.position.final" for name in names}
+    return replace(bed, quantities=kept, budget=240, edges=(), own=tuple(ends.items()), local=True)
+
+
+def acted(bed: Testbed, do: Mapping[str, Any]) -> tuple[Edge, ...]:
+    """Return which settable states acted on which outcomes in one run.
+
+    They did if edges of the local graphs of its control steps lead from one to the other, in the
+    order of time. An edge by contact is there in steps in which a chain of contacts joins its ends.
+    """
+    live = bed.world.live(bed.setting["policy"], do=do)
+    reached = {cause: {cause} for cause, _ in bed.own}
+    for _ in range(bed.setting["steps"]):
+        graph = live.world.local_graph(live.world.task.idle(live.world))
+        reached = {
+            cause: {effect for one in some for effect in graph.successors(one)}
+            for cause, some in reached.items()
+        }
+        live.step()
+    live.close()
+    return tuple(
+        (cause, one.name)
+        for cause, some in reached.items()
+        for one in bed.outcomes
+        if one.reads and one.reads.name in some and (cause, one.name) not in bed.own
     )
 
 
@@ -544,6 +605,7 @@ WORLDS: Mapping[str, tuple[Callable[[np.random.Generator, Knobs], Testbed], str]
     "equations": (equations, "A random acyclic model of equations."),
     "servo": (servos, "Arms whose servos follow one another."),
     "network": (network, "Masses on a random network of springs, for one step."),
+    "row": (row, "Boxes on a rail, which act on one another only while they touch."),
     **{name: (partial(rig, made), made.doc) for name, made in RIGS.items()},
 }
 

@@ -17,10 +17,10 @@ import pytest
 
 from scm_world import lab
 from scm_world.errors import ScmWorldError
+from scm_world.lab import worlds
 from scm_world.lab.agents import DESIGNS, ROUNDS, _confounded, _Known, _Seen
 from scm_world.lab.expressions import evaluate
 from scm_world.lab.questions import LevelView, build
-from scm_world.lab.worlds import RIGS, testbed
 
 
 def test_a_question_is_answered_by_the_solver_and_by_no_trivial_answer() -> None:
@@ -264,16 +264,23 @@ def test_the_command_runs_replays_and_plays(tmp_path: Path) -> None:
     assert played.exit_code == 0, played.output
     assert "not JSON" in played.output
     assert '"brier"' in played.output
+    (secret := tmp_path / "key.txt").write_text("a secret of a test\n")
+    asked = ["lab", "run", "--seed", "3", "--out", path]
+    private = run.invoke(app, [*asked, "--key", str(secret)])
+    assert private.exit_code == 0, private.output
+    in_room = {"SCM_LAB_KEY": "a secret of a test"}
+    assert "identical" in run.invoke(app, ["lab", "replay", path], env=in_room).output
+    assert run.invoke(app, ["lab", "replay", path]).exit_code == 1
     assert "counterfactual" in run.invoke(app, ["lab", "list"]).output
     assert run.invoke(app, ["lab", "replay"]).exit_code == 2
 
 
 def test_a_strike_moves_the_block_as_in_plain_mujoco() -> None:
     """The mean under an intervention is what the engine gives for these numbers."""
-    rng, names = np.random.default_rng(3), [*RIGS["pushing"].causes]
-    view = LevelView(testbed("pushing", rng, lab.Knobs()), "L2", lab.Knobs(), 3)
+    rng, names = np.random.default_rng(3), [*worlds.RIGS["pushing"].causes]
+    view = LevelView(worlds.testbed("pushing", rng, lab.Knobs()), "L2", lab.Knobs(), 3)
     do = {name: 0.3 * view.ends(name)[0] + 0.7 * view.ends(name)[1] for name in names}
-    xml = RIGS["pushing"].xml("plain", np.random.default_rng(3).uniform(0.7, 1.4, 3))
+    xml = worlds.RIGS["pushing"].xml("plain", np.random.default_rng(3).uniform(0.7, 1.4, 3))
     model = mujoco.MjModel.from_xml_string(xml)
     data = mujoco.MjData(model)
     for body in ("pusher", "block"):
@@ -322,3 +329,41 @@ def test_an_episode_that_was_run_is_looked_at_and_it_is_the_same_episode() -> No
     masked = lab.Laboratory(build("effect", "boxes", 1, "L3", lab.Knobs(), 0, None))
     masked.observe()
     assert "level L3" in masked.call("look", {"episode": 0})["refused"]
+
+
+def test_speeds_act_on_other_boxes_where_plain_mujoco_says_so_and_only_by_contact(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Finite differences of the engine around the run have the same edges; without contact none."""
+    files, real = list[str](), worlds._model
+    monkeypatch.setattr(worlds, "_model", lambda *of: files.append(real(*of)) or files[-1])
+    asked = build("graph", "row", 6, "L2", lab.Knobs(), 1, None)
+    given = {name: value for name, value in asked.query["set"].items() if "box" in name}
+
+    def final(speeds: dict[str, float], *, contact: bool) -> dict[str, float]:
+        model = mujoco.MjModel.from_xml_string(files[-1])
+        if not contact:
+            model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+        data = mujoco.MjData(model)
+        for name, value in speeds.items():
+            data.joint(name.partition(".")[0]).qvel = value
+        mujoco.mj_step(model, data, nstep=240)
+        return {name: float(data.joint(name.partition(".")[0]).qpos[0]) for name in speeds}
+
+    def edges(*, contact: bool) -> list[list[str]]:
+        found = []
+        for cause, value in given.items():
+            low, high = (
+                final({**given, cause: value + apart}, contact=contact) for apart in (-0.02, 0.02)
+            )
+            found += [
+                [cause, name.replace("velocity", "position.final")]
+                for name in given
+                if name != cause and abs(high[name] - low[name]) > 1e-9
+            ]
+        return sorted(found)
+
+    assert len(asked.answer["edges"]) == 5  # one pair in one direction only
+    assert edges(contact=True) == asked.answer["edges"]
+    assert edges(contact=False) == []
+    assert asked.grade({"edges": asked.answer["edges"]}) == 1.0
