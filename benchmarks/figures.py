@@ -515,6 +515,34 @@ def real() -> Any:
     return figure
 
 
+@styled
+def laboratories() -> Any:
+    """Draw scores of agents in laboratories by budget: of each kind and level, and of all."""
+    found = read("lab.json")["curves"]
+    shares = np.array(found["shares"])
+    names = [name for name, one in found.items() if isinstance(one, Mapping)]
+    figure = blank(13.0, 9.5, layout="constrained")
+    axes = figure.subplots(3, 5, sharex=True, sharey=True).flat
+    for axis, name in zip(axes, names, strict=False):
+        one = found[name]
+        for number, (agent, rows) in enumerate(one["agents"].items()):
+            interval(axis, shares * 1.035 ** (number - 2.5), rows, agent, PALETTE[number])
+            axis.plot(shares, [row["value"] for row in rows], color=PALETTE[number], linewidth=1)
+        trivial = one["best trivial answer"]["value"]
+        axis.axhline(trivial, color=GREY, linestyle="--", label="best trivial answer")
+        axis.set_xscale("log")
+        axis.set_xticks(shares, [f"{share:g}" for share in shares])
+        axis.minorticks_off()
+        titled(axis, f"{name} ({one['questions']})", ylim=(-0.03, 1.03))
+    lines, labels = axes[0].get_legend_handles_labels()
+    for axis in axes[len(names) :]:
+        axis.axis("off")
+        axis.legend(lines, labels, loc="center")
+    figure.supxlabel("budget, in that of the question")
+    figure.supylabel("score, with 95 % intervals over questions")
+    return figure
+
+
 PICTURES: Mapping[str, Callable[[], Any]] = {
     "coverage": coverage,
     "rare-failures": rare_failures,

@@ -4,8 +4,10 @@
 
     python -m benchmarks.lab questions --n 25  # of each kind: certificates and CPU time
     python -m benchmarks.lab truth             # their answers, by an independent script
-    python -m benchmarks.lab names             # the most frequent answers that are names
+    python -m benchmarks.lab names --n 40      # guesses by names, of seeds of each world
     python -m benchmarks.lab suites --made DIR # the manifests, with the hashes of made folders
+    python -m benchmarks.lab curves            # scores of agents by budget; ten minutes, resumable
+    python -m benchmarks.lab trained           # PPO on experiments, beside two simple agents
 
 The figures are in ``lab.json``. Questions are those of ``lab-1``, in the order of its parts.
 """
@@ -14,20 +16,22 @@ from __future__ import annotations
 
 import argparse
 import json
+import runpy
 import time
 from collections import Counter, defaultdict
 from contextlib import suppress
-from itertools import product
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks import as_json
+from benchmarks import as_json, figures
 from benchmarks.lab_truth import confirm
 from scm_world import lab
 from scm_world.discovery.data import load
 from scm_world.discovery.learners.registry import learn
+from scm_world.evaluation.statistics import mean_interval
 from scm_world.lab import suites
 from scm_world.lab.questions import Question, Unusable, build
 from scm_world.runs.pool import Pool
@@ -158,17 +162,159 @@ def table(rows: list[dict[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def names() -> dict[str, dict[str, dict[str, int]]]:
-    """Count answers that are names, of 16 draws of each rig that need not be certified."""
-    found = dict[str, dict[str, dict[str, int]]]()
-    for kind, world in product(("explanation", "diagnosis"), lab.offers("explanation")):
-        counts = Counter[str]()
-        for seed in range(1, 41):
+def named(rows: list[tuple[str, str]]) -> dict[str, Any]:
+    """Return how often the most frequent name of each world is right.
+
+    It is chosen on every other row and counted on the others, and the other way round, so that
+    chance does not raise it. The interval is that of Wilson.
+    """
+    right, counts = list[float](), defaultdict[str, Counter[str]](Counter)
+    for half in (0, 1):
+        often = defaultdict[str, Counter[str]](Counter)
+        for world, name in rows[half::2]:
+            often[world][name] += 1
+        right += [name == often[world].most_common(1)[0][0] for world, name in rows[1 - half :: 2]]
+    for world, name in rows:
+        counts[world][name] += 1
+    share = mean_interval(np.array(right, float), proportion=True)
+    return {
+        "questions": len(rows),
+        "most frequent name": [round(x, 3) for x in (share.value, share.low, share.high)],
+        "answers": {world: dict(of.most_common()) for world, of in counts.items()},
+    }
+
+
+def names(n: int) -> dict[str, Any]:
+    """Score guesses by names: of ``n`` seeds of each world, which need not be certified."""
+    found, typical = dict[str, Any](), list[list[float]]()
+
+    def first(kind: str, world: str, seed: int) -> Question:
+        for draw in range(40):
             with suppress(Unusable):
-                if counts.total() < 16:
-                    counts[build(kind, world, seed, "L2", lab.Knobs(), 0, None).answer] += 1
-        found.setdefault(kind, {})[world] = dict(counts.most_common())
+                return build(kind, world, seed, "L2", lab.Knobs(), draw, None)
+        raise Unusable([f"seed {seed}"])
+
+    for kind in ("explanation", "diagnosis"):
+        worlds = lab.offers(kind)
+        rows = [(world, first(kind, world, seed).answer) for seed in range(n) for world in worlds]
+        found[kind] = named(rows)
+    for world in lab.offers("effect"):
+        asked, same = [first("effect", world, seed) for seed in range(n)], defaultdict(list)
+        for one in asked:
+            same[one.query["cause"], one.query["outcome"]].append(one)
+        for many in (many for many in same.values() if len(many) > 1):
+            for one in many:
+                others = [other.answer for other in many if other is not one]
+                guess = float(np.median(others))
+                typical.append([guess * one.answer > 0.0, one.grade(guess)])
+    sign, score = np.mean(typical, axis=0)
+    found["effect"] = {
+        "questions": len(typical),
+        "sign of the median effect of the same names": round(float(sign), 3),
+        "score of that median": round(float(score), 3),
+    }
+    scores = defaultdict[str, list[float]](list)
+    for world in lab.offers("graph"):
+        for seed in range(n):
+            one = first("graph", world, seed)
+            causes = sorted(name for name, of in one.view.quantities.items() if of.sets)
+            read = sorted(n for n in one.view.readable if n not in causes) or causes
+            pairs = [[a, b] for i, a in enumerate(causes) for j, b in enumerate(read) if i != j]
+            chain = [[a, read[i + 1]] for i, a in enumerate(causes[:-1]) if i + 1 < len(read)]
+            forward = [[a, b] for a, b in pairs if a.split(".")[0] < b.split(".")[0]]
+            for name, edges in (("next in order", chain), ("earlier on later", forward)):
+                scores[name].append(one.grade({"edges": edges}))
+    found["graph"] = {name: round(float(np.mean(of)), 3) for name, of in scores.items()}
     return found
+
+
+# --- agents ---------------------------------------------------------------------------------------
+
+SHARES = (0.25, 0.5, 1.0, 2.0)
+EACH = 3
+"""Questions of each kind and level."""
+
+
+def budgeted(question: Question, share: float) -> Question:
+    """Return the same question with a share of its budget."""
+    view = question.view.fresh()
+    view.testbed = replace(view.testbed, budget=round(share * question.budget))
+    return replace(question, view=view)
+
+
+def curved(job: dict[str, Any]) -> dict[str, Any]:
+    """Return the scores of all agents on a question, by budget."""
+    spec = {name: job[name] for name in ("kind", "world", "seed", "level")}
+    try:
+        made = lab.question(**spec, **job["knobs"])
+    except Unusable as error:
+        return {**job, "error": str(error)[:200]}
+    played = {
+        agent: [lab.play(agent, budgeted(made, share)).score or {} for share in SHARES]
+        for agent in lab.AGENTS
+    }
+    found = {agent: [one["score"] for one in ones] for agent, ones in played.items()}
+    return {**job, "scores": found, "trivial": max((made.certificate or {})["trivial"].values())}
+
+
+def curves(out: Path, workers: int) -> dict[str, Any]:
+    """Play questions of ``lab-1`` that are not of servos; continue with the same file.
+
+    Levels begin one after another in the list of worlds, so that all worlds have their turn. The
+    first three are left out: the agents were written with some of them.
+    """
+    wanted = list[dict[str, Any]]()
+    for number, level in enumerate(lab.LEVELS, 1):
+        for kind in lab.KINDS:
+            every = suites._specs(recipes()[f"{kind}-{level}"])[EACH * number :]
+            wanted += [job for job in every if job["world"] != "servo"][:EACH]
+    rows = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
+    known = [{name: row[name] for name in wanted[0]} for row in rows]
+    with Pool("process" if workers > 1 else None, workers) as pool, out.open("a") as file:
+        for _, row in pool.run(curved, [job for job in wanted if job not in known]):
+            rows.append(row)
+            file.write(json.dumps(row) + "\n")
+            file.flush()
+    return averaged([row for row in rows if {n: row[n] for n in wanted[0]} in wanted])
+
+
+def averaged(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return mean scores with intervals over questions: by kind, by level, and of all."""
+    good = [row for row in rows if "scores" in row]
+
+    def means(values: Any, **more: Any) -> list[dict[str, float]]:
+        each = [mean_interval(column, **more) for column in np.transpose(values)]
+        return [{"value": o.value, "low": o.low, "high": o.high} for o in each]
+
+    found: dict[str, Any] = {"shares": SHARES, "seeds without a question": len(rows) - len(good)}
+    for name in (*lab.KINDS, *lab.LEVELS, "all"):
+        some = [row for row in good if name in (row["kind"], row["level"], "all")]
+        of = {agent: np.array([row["scores"][agent] for row in some]) for agent in lab.AGENTS}
+        found[name] = {
+            "questions": len(some),
+            "agents": {agent: means(score, proportion=True) for agent, score in of.items()},
+            "best trivial answer": means([[row["trivial"]] for row in some], proportion=True)[0],
+            "minus random": {
+                agent: means(of[agent] - of["random"], proportion=False)
+                for agent in of
+                if agent != "random"
+            },
+        }
+    return found
+
+
+def trained(steps: int) -> dict[str, Any]:
+    """Train PPO to choose experiments, and compare it on questions that it has not seen."""
+    compare = runpy.run_path(str(HERE.parent / "examples" / "lab_agents.py"))["compare"]
+    begin = time.process_time()
+    found = {name: np.array(scores) for name, scores in compare(steps).items()}
+    minus = {
+        f"trained minus {name}": mean_interval(found["trained"] - found[name], proportion=False)
+        for name in ("random", "information")
+    }
+    every = {name: mean_interval(one, proportion=True) for name, one in found.items()} | minus
+    rows = {name: {"value": o.value, "low": o.low, "high": o.high} for name, o in every.items()}
+    return {"steps": steps, "CPU seconds": round(time.process_time() - begin), **rows}
 
 
 # --- manifests ------------------------------------------------------------------------------------
@@ -247,15 +393,27 @@ def manifests(made: dict[str, Path]) -> None:
         (MANIFESTS / f"{name}.json").write_text(text + "\n")
 
 
+PARTS = ("questions", "truth", "names", "suites", "curves", "trained")
+
+
 def main() -> None:
     """Run one part."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("part", choices=("questions", "truth", "names", "suites"))
+    parser.add_argument("part", choices=PARTS)
     parser.add_argument("--n", type=int, default=25)
     parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--rows", type=Path, default=HERE / "lab_questions.jsonl")
+    parser.add_argument("--rows", type=Path)
+    parser.add_argument("--steps", type=int, default=60_000)
     parser.add_argument("--made", type=Path, nargs="*", default=[])
     given = parser.parse_args()
+    part = "curves" if given.part == "curves" else "questions"
+    given.rows = given.rows or HERE / f"lab_{part}.jsonl"
+    known = json.loads(RESULTS.read_text())
+    if given.part in ("curves", "trained"):
+        one = trained(given.steps) if given.part == "trained" else curves(given.rows, given.workers)
+        RESULTS.write_text(as_json({**known, given.part: one}) + "\n")
+    if given.part == "curves":
+        figures.main(["lab"])
     if given.part == "questions":
         questions(given.n, given.workers, given.rows)
     if given.part == "truth":
@@ -266,11 +424,9 @@ def main() -> None:
                 outcome = confirm(Question.of(row["spec"]))["confirmed"]
                 count = found[row["spec"]["kind"]].setdefault("confirmed", {})
                 count[str(outcome)] = count.get(str(outcome), 0) + 1
-        known = json.loads(RESULTS.read_text())
         RESULTS.write_text(as_json({**known, "questions": found}) + "\n")
     if given.part == "names":
-        known = json.loads(RESULTS.read_text())
-        RESULTS.write_text(as_json({**known, "names": names()}) + "\n")
+        RESULTS.write_text(as_json({**known, "names": names(given.n)}) + "\n")
     if given.part == "suites":
         manifests({path.name: path for path in given.made})
 

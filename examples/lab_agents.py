@@ -51,23 +51,28 @@ def scores(env: LabEnv, agent: Callable[[np.ndarray], Any]) -> list[float]:
     return found
 
 
-def main(steps: str = "0", compared: str = "40") -> None:
-    """Print mean scores with intervals."""
-    env = opened(range(int(compared)))
+def compare(steps: int = 0, n: int = 40) -> dict[str, list[float]]:
+    """Return the score of each question by agent; one trains so many steps on other questions."""
+    env = opened(range(n))
     env.action_space.seed(0)
-    n = len(env.action_space.nvec)
+    causes = len(env.action_space.nvec)
     agents: dict[str, Callable[[np.ndarray], Any]] = {
         "random": lambda _: env.action_space.sample(),
-        "information": lambda observation: informed(observation, n),
+        "information": lambda observation: informed(observation, causes),
     }
-    if int(steps):
+    if steps:
         from stable_baselines3 import PPO
 
         model = PPO("MlpPolicy", opened(TRAINED_ON), seed=0, device="cpu", ent_coef=0.01)
-        model.learn(int(steps))
+        model.learn(steps)
         agents["trained"] = lambda seen: model.predict(seen, deterministic=True)[0]
-    for name, agent in agents.items():
-        print(f"{name}: {mean_interval(scores(env, agent), proportion=True)}")
+    return {name: scores(env, agent) for name, agent in agents.items()}
+
+
+def main(steps: str = "0", compared: str = "40") -> None:
+    """Print mean scores with intervals."""
+    for name, found in compare(int(steps), int(compared)).items():
+        print(f"{name}: {mean_interval(found, proportion=True)}")
 
 
 if __name__ == "__main__":

@@ -303,7 +303,11 @@ def of_fits(folder: Path) -> Iterator[Case]:
     yield from of(fit, counterfactual={"do": {"rate": 0.5}, **once}, picture={"run": 0})
     yield from of(fit, suggest={"n": 1, "steps": 3, "limits": None, "seed": 0})
     yield from of(fit, deviates={"name": "rate"}, save={"path": str(folder / "fit.yaml")})
-    yield from of(fit, predict={"recording": recorded, "ahead": 0.2}, diagnose={"progress": None})
+    yield from of(
+        fit,
+        predict={"recording": recorded, "ahead": 0.2},
+        diagnose={"terms": "*", "progress": None},
+    )
 
 
 def of_models(_: Path) -> Iterator[Case]:

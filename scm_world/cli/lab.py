@@ -18,8 +18,6 @@ from scm_world.cli import console, options
 if TYPE_CHECKING:
     from scm_world.lab import Laboratory, Question
 
-Key = Annotated[str | None, typer.Option(envvar="SCM_LAB_KEY")]
-
 
 @dataclass
 class QuestionOptions:
@@ -29,7 +27,6 @@ class QuestionOptions:
         kind: Kind of the question; see scm-world lab list.
         world: World of the question, or a model file.
         level: Prior knowledge, L1 to L4.
-        key: Secret of private questions.
         noise: Noise of readings, as a share of their spread.
         law: Law of springs and drag: plain, cubic, square or 'dead zone'.
     """
@@ -38,7 +35,7 @@ class QuestionOptions:
     world: str = "equations"
     seed: options.NotNegative = 0
     level: str = "L2"
-    key: Key = None
+    key: options.Key = None
     noise: options.Amount = 0.02
     law: str = "plain"
 
@@ -80,7 +77,7 @@ def run(asked: QuestionOptions, *, agent: str = "random", out: options.Text = No
     Example: scm-world lab run --kind effect --world springs --seed 3 --agent random
 
     Args:
-        agent: random or ideal.
+        agent: random, one-at-a-time, pairs, do_order, information or ideal.
         out: File of the run, for scm-world lab replay.
     """
     from scm_world import lab
@@ -88,16 +85,35 @@ def run(asked: QuestionOptions, *, agent: str = "random", out: options.Text = No
     _finish(lab.play(agent, asked.question()), out)
 
 
-def play(asked: QuestionOptions, *, out: options.Text = None) -> None:
-    """Answer a question by hand: type a tool and its arguments as JSON.
+def play(
+    asked: QuestionOptions,
+    *,
+    out: options.Text = None,
+    page: bool = False,
+    port: Annotated[int, typer.Option(min=0, max=65535)] = 8730,
+    open_: bool = False,
+) -> None:
+    """Answer a question by hand: type a tool and its arguments as JSON, or use a page.
 
-    Example: scm-world lab play --kind effect --world springs
+    Example: scm-world lab play --kind effect --world springs --page --open
 
     Args:
         out: File of the run, for scm-world lab replay.
+        page: Serve a page with a form for each tool, until Ctrl-C.
+        port: Port of the page; 0 for any that is free.
+        open_: Open the page in the usual browser.
     """
     from scm_world import lab
 
+    if page:
+        for package in ("starlette", "uvicorn"):
+            load(package, package, "studio")
+        from scm_world.studio.lab import serve as served
+
+        room = lab.Laboratory(asked.question())
+        served(room, port=port, open_=open_, say=console.say)
+        _finish(room, out)
+        return
     room = lab.Laboratory(asked.question())
     typer.echo(json.dumps(room.call("describe"), indent=1, ensure_ascii=False))
     typer.echo('Type for example: experiment {"do": {"x0": 1}, "n": 5}')
@@ -119,14 +135,15 @@ def _finish(room: Laboratory, out: str | None) -> None:
         console.say(f"written: {room.save(Path(out))}", stderr=True)
 
 
-def replay(file: Annotated[str, typer.Argument(metavar="FILE")], *, key: Key = None) -> None:
+def replay(
+    file: Annotated[str, typer.Argument(metavar="FILE")], *, key: options.Key = None
+) -> None:
     """Repeat a saved run, and say what differs; the exit code is then 1.
 
     Example: scm-world lab replay run.json
 
     Args:
         file: The file that scm-world lab run wrote.
-        key: Secret of a private question.
     """
     from scm_world import lab
 
@@ -143,7 +160,7 @@ def serve(
     level: str = "L2",
     n: options.N = 1,
     seed: options.NotNegative = 0,
-    key: Key = None,
+    key: options.Key = None,
     out: options.Text = None,
     mcp: bool = False,
     http: bool = False,
@@ -163,7 +180,6 @@ def serve(
         level: What agents know beforehand: L1, L2, L3 or L4.
         n: How many questions of each kind.
         seed: Seed of the first one; the others follow.
-        key: A secret, by which the questions are private.
         out: Folder in which every call is recorded. With the same folder a new server continues
             unfinished runs.
         mcp: Serve the Model Context Protocol; there is no other one.

@@ -9,6 +9,7 @@ import copy
 import inspect
 import json
 import math
+import os
 import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -21,13 +22,22 @@ import typer
 
 import scm_world as sw
 from scm_world.cli import console
-from scm_world.errors import ConflictingTargets, UnknownOption
-from scm_world.runs.files import Location
+from scm_world.errors import ConflictingTargets, UnknownOption, reading
+from scm_world.runs.files import Location, read_text
 
 if TYPE_CHECKING:
     from scm_world.tasks import WorldSource
 
 # --- kinds of options -----------------------------------------------------------------------------
+
+
+def secret(path: str | None) -> str | None:
+    """Return the secret that is in a file, or, without a file, in ``SCM_LAB_KEY``."""
+    if path is None:
+        return os.environ.get("SCM_LAB_KEY")
+    with reading(path, "give a text file with a secret of at least 16 characters"):
+        return read_text(path).strip()
+
 
 Text = str | None
 Count = Annotated[int, typer.Option(min=1)]
@@ -44,6 +54,7 @@ Backend = Annotated[str | None, typer.Option(show_default="that of the task")]
 ManyWorkers = Annotated[int | None, typer.Option(min=0, show_default="as many as there are cores")]
 Out = Annotated[str | None, typer.Option(metavar="PATH", show_default="under scm-world-results")]
 System = Annotated[str, typer.Argument(metavar="SYSTEM")]
+Key = Annotated[str | None, typer.Option(metavar="FILE", callback=secret)]
 Assignments = Annotated[list[str], typer.Argument(metavar="NAME=VALUE...")]
 
 HELP = {
@@ -63,6 +74,8 @@ HELP = {
     "nature": "Context distribution: variation between episodes, such as gravity=draw:A.",
     "outcome": "Outcome, such as reward or sum:reward.",
     "out": "Folder for the results, or a URL such as s3://bucket/run.",
+    "key": "File with a secret of at least 16 characters, for private questions; without it, "
+    "SCM_LAB_KEY has the secret.",
     "shard": "Episodes in one file; of worlds 500, or as many as the engine steps best together.",
     "size": "Height and width of a picture in pixels.",
     "croissant": "Write README.md and croissant.json, too, by which Hugging Face and mlcroissant "

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from scm_world.cli import console, options
-from scm_world.runs.files import located, read_text
+from scm_world.runs.files import located
 
 Name = Annotated[str, typer.Argument(metavar="NAME")]
 Answers = Annotated[str, typer.Argument(metavar="ANSWERS")]
@@ -30,7 +30,9 @@ def list_() -> None:
     console.frame(rows)
 
 
-def make(name: Name, *, key: Path = None, out: options.Out = None, jobs: options.ManyJobs) -> None:
+def make(
+    name: Name, *, key: options.Key = None, out: options.Out = None, jobs: options.ManyJobs
+) -> None:
     """Make a suite in a folder, and compare its hashes with the manifest.
 
     The folder has the layout of Hugging Face, with Croissant. Exits 1 if a part differs. After
@@ -39,13 +41,12 @@ def make(name: Name, *, key: Path = None, out: options.Out = None, jobs: options
 
     Args:
         name: Name of a suite; see 'scm-world suite list'.
-        key: File with a secret of at least 16 characters, for the private questions.
     """
     from scm_world.lab.suites import suite
 
     found, folder = suite(name), console.results_folder(out, "suite", name)
     with jobs.open("parts", folder, "*.parquet", "parts") as job:
-        made = found.make(key=_secret(key), **job)
+        made = found.make(key=key, **job)
     rows = sum(part["rows"] for part in made.parts.values())
     known = sum("sha256" in found.manifest["parts"][part] for part in made.parts)
     console.say(
@@ -67,7 +68,7 @@ def score(
     answers: Answers,
     *,
     made: Path = None,
-    key: Path = None,
+    key: options.Key = None,
     jobs: options.ManyJobs,
 ) -> None:
     """Grade answers to a suite, by kind and level, with 95 % intervals.
@@ -78,15 +79,10 @@ def score(
         name: Name of a suite; see 'scm-world suite list'.
         answers: Parquet, CSV or JSONL with the columns question, answer (JSON) and confidence.
         made: Folder of 'suite make'; without it the parts with answers are made again.
-        key: File with the secret of the private questions.
     """
     from scm_world.lab.suites import suite
 
     with jobs.open("parts", located(made or answers), "*.parquet", "parts") as job:
         job.pop("out")
-        table = suite(name).score(answers, made=made, key=_secret(key), **job)
+        table = suite(name).score(answers, made=made, key=key, **job)
     console.frame(table, title=f"{name}: mean scores with 95 % intervals")
-
-
-def _secret(path: str | None) -> str | None:
-    return None if path is None else read_text(path).strip()

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, cast, final
 
 import numpy as np
 
+from scm_world._patterns import fitting
 from scm_world._types import Floats, Integers
 from scm_world.errors import ModelError, ScmWorldError
 from scm_world.fit.problem import (
@@ -226,11 +227,13 @@ class Diagnosing:
 
     Args:
         fit: The fit.
+        patterns: Names or patterns of the terms.
         progress: Called after each term.
     """
 
-    def __init__(self, fit: Fit, progress: Progress | None) -> None:
+    def __init__(self, fit: Fit, patterns: Sequence[str], progress: Progress | None) -> None:
         self._fit, self._progress, self._untried = fit, progress, list[str]()
+        self._patterns = patterns
         self._world, windows = fit.asked, windows_of(fit.runs, fit.window)
         share = ROWS / sum(len(run.instants) for run in fit.runs)
         count = min(len(windows), round(share * len(windows)) or 1)
@@ -246,9 +249,10 @@ class Diagnosing:
 
     def run(self) -> Diagnosis:
         """Try all terms; after Ctrl-C, those that were tried are returned."""
-        fits = dict[Key, Any]()
+        fits, terms = dict[Key, Any](), [*self._terms()]
+        chosen = fitting(self._patterns, {term.key[0]: None for term in terms}, "terms")
+        terms = [term for term in terms if term.key[0] in chosen]
         plain = self._fitted(Term(("", ""), self._world), self._begin, MANY)
-        terms = [*self._terms()]
         try:
             for number, term in enumerate(terms, 1):
                 try:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._arguments import typed, whole_number
+from scm_world._patterns import as_names
 from scm_world._types import Floats, Integers
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.fit.design import PROBES, Experiment, suggested, unseen
@@ -626,7 +627,9 @@ class Fit:
         return posterior_of(self.targets, self.scaled, self.spread)
 
     @typed
-    def diagnose(self, *, progress: Progress | None = None) -> Diagnosis:
+    def diagnose(
+        self, terms: str | Sequence[str] = "*", *, progress: Progress | None = None
+    ) -> Diagnosis:
         """Find out what kind of error of the model leaves the residuals.
 
         Standard terms are added to the world one at a time, and fitted together with the
@@ -636,9 +639,13 @@ class Fit:
         tried in about 1000 rows, in windows that are spread over the recording.
 
         Args:
+            terms: Names or patterns of the terms, such as ``"*friction*"``; all by default.
             progress: Called after each term. After Ctrl-C, the terms that were tried are returned.
+
+        Raises:
+            UnknownOption: No term of this world fits a pattern.
         """
-        return Diagnosing(self, progress).run()
+        return Diagnosing(self, as_names(terms), progress).run()
 
     @typed
     def save(self, path: str | Path) -> None:

@@ -5,16 +5,21 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
 from itertools import combinations, pairwise
 from typing import Any
 
+import networkx as nx
 import numpy as np
 
 from scm_world._arguments import one_of
 from scm_world._types import Floats
+from scm_world.discovery.data import Dataset
+from scm_world.discovery.learners.do_order import do_order
 from scm_world.lab.expressions import evaluate
 from scm_world.lab.laboratory import ROWS, Laboratory
-from scm_world.lab.questions import Question
+from scm_world.lab.questions import PASSED, Question
 
 Columns = Mapping[str, Floats]
 
@@ -106,6 +111,8 @@ def ideal(room: Laboratory) -> None:
 
 
 def _solve_graph(known: _Known) -> Any:
+    if "set" in known.query:
+        return _solve_local(known)
     outcomes = [n for n in known.readable if n not in known.ends] or known.readable
     together, tables = outcomes != known.readable, {}
     n = known.budget if together else int(0.8 * known.budget) // len(outcomes)
@@ -129,16 +136,33 @@ def _solve_graph(known: _Known) -> Any:
                 edges.append([cause, outcome])
     if together:
         return {"edges": edges, "hidden": []}
-    return {"edges": edges, "hidden": _confounded(known, edges, tables)}
-
-
-def _confounded(known: _Known, edges: list[list[str]], tables: Mapping[str, Columns]) -> Any:
-    """Return pairs whose parts without a cause are correlated in observations."""
     seen = _experiment(known.room, {}, known.room.remaining)
-    left = {}
+    unexplained = dict[str, Floats]()
     for outcome, table in tables.items():
         causes = [c for c, e in edges if e == outcome]
-        left[outcome] = seen[outcome] - _model(table, causes, table[outcome])(seen)
+        unexplained[outcome] = seen[outcome] - _model(table, causes, table[outcome])(seen)
+    return {"edges": edges, "hidden": _confounded(unexplained)}
+
+
+def _solve_local(known: _Known) -> Any:
+    """Return which outcomes of a run differ when one variable is set a little lower and higher."""
+    q, edges = known.query, list[list[str]]()
+    n = known.budget // (2 * len(q["set"]))
+    for name, value in q["set"].items():
+        apart = 0.04 * (known.ends[name][1] - known.ends[name][0])
+        one, other = (
+            _experiment(known.room, {**q["set"], name: value + step}, n) for step in (-apart, apart)
+        )
+        for outcome in (o for o in known.readable if o not in known.ends):
+            error = np.sqrt((np.var(one[outcome]) + np.var(other[outcome])) / (n - 1))
+            far = abs(one[outcome].mean() - other[outcome].mean()) > 4.5 * error
+            if far and [name, outcome] not in q["known"]:
+                edges.append([name, outcome])
+    return {"edges": edges, "hidden": []}
+
+
+def _confounded(left: Mapping[str, Floats]) -> Any:
+    """Return pairs whose parts without a cause, in observations, are correlated."""
     n = len(next(iter(left.values())))
     return [
         [a, b]
@@ -164,7 +188,7 @@ def _solve_law(known: _Known) -> Any:
     """Return the mean of an outcome as an expression of its cause."""
     cause, outcome = known.query["cause"], known.query["outcome"]
     low, high = known.ends[cause]
-    places = np.linspace(low, high, 32 if known.query["held"] else 16)
+    places = np.linspace(low, high, min(32 if known.query["held"] else 16, known.budget))
     n = known.budget // len(places)
     dos = [{**known.query["held"], cause: float(place)} for place in places]
     y = np.array([_experiment(known.room, do, n)[outcome].mean() for do in dos])
@@ -218,7 +242,8 @@ def _solve_explanation(known: _Known) -> Any:
 
 def _solve_diagnosis(known: _Known) -> Any:
     q, outcomes = known.query, [*known.query["run"]]
-    n = known.budget // (4 * len(known.ends) + 2)
+    shares = (0.08, 0.3, 0.7, 0.92) if known.budget > 4 * len(known.ends) + 1 else (0.08, 0.92)
+    n = known.budget // (len(shares) * len(known.ends) + 2)
 
     def readings(do: Mapping[str, Any], many: int) -> Floats:
         table = _experiment(known.room, do, many)
@@ -228,13 +253,12 @@ def _solve_diagnosis(known: _Known) -> Any:
     run, errors = np.array([q["run"][o] for o in outcomes]), dict[str, float]()
     places: dict[str, list[Floats]] = {}
     for name, (low, high) in known.ends.items():
-        shares = (0.08, 0.3, 0.7, 0.92)
         places[name] = [
             readings({**q["usual"], name: low + share * (high - low)}, n) for share in shares
         ]
     size = np.std([one for many in places.values() for one in many], axis=0) + 1e-12
     for name, many in places.items():
-        line = [*many[:2], usual, *many[2:]]
+        line = [*many[: len(many) // 2], usual, *many[len(many) // 2 :]]
         errors[name] = min(
             _distance(run / size, one / size, other / size) for one, other in pairwise(line)
         )
@@ -274,9 +298,11 @@ def trivial(question: Question) -> dict[str, Any]:
         every = [[a, b] for a in known.ends for b in known.readable if a != b]
         strong = [e for e in every if abs(np.corrcoef(seen[e[0]], seen[e[1]])[0, 1]) > 0.3]
         forward = [e for e in every if e[0] < e[1]]
+        ends = [[a, b] for a, _ in q["known"] for _, b in q["known"]] if "set" in q else every
         return {
             "no effect": {"edges": []},
             "all": {"edges": every},
+            "all of one kind": {"edges": ends},
             "regression": {"edges": [e for e in strong if e in forward] or strong},
         }
     if kind in ("explanation", "diagnosis"):
@@ -309,45 +335,252 @@ def trivial(question: Question) -> dict[str, Any]:
 
 
 def certify(question: Question) -> dict[str, Any]:
-    """Return the scores of the solver and of the trivial answers."""
+    """Return the scores of the solver and, if it passes, those of the trivial answers."""
     room = Laboratory(question)
     ideal(room)
     assert room.score is not None  # noqa: S101 # it has submitted
+    if room.score["score"] < PASSED:
+        return {"solver": room.score["score"], "trivial": {}}
     found = {name: question.grade(answer) for name, answer in trivial(question).items()}
     if not found:
-        found = {"guess": 1.0 / len(question.query["usual"])}
+        found = {"most frequent name": 1.0 / len(question.view.testbed.causes)}
     return {"solver": room.score["score"], "trivial": found}
 
 
-# --- further agents -------------------------------------------------------------------------------
+# --- agents that choose one experiment after another ----------------------------------------------
+
+ROUNDS, GRID, PRIOR = 16, 33, 0.01
+"""Experiments of a run; places of a law; prior precision of a weight, in that of a reading."""
 
 
-def guess(room: Laboratory) -> None:
-    """Set one variable at random, five times, and answer at random."""
+class _Seen:
+    """Rows of experiments as columns of a regression, and the estimates from them.
+
+    Where everything but the outcome is set, or nothing settable acts on anything settable, a column
+    has the values of a variable. Otherwise it has them where the variable was set, and another
+    column says where that was, so that an effect includes what it moves on its way.
+    """
+
+    def __init__(self, known: _Known, rng: np.random.Generator) -> None:
+        self.known, self.rng, self.turn = known, rng, 0
+        self.by_value = known.independent or known.kind == "prediction"
+        self.outcomes = [n for n in known.readable if n not in known.ends] or known.readable
+        self.rows = {name: np.zeros(0) for name in known.readable}
+        self.is_set = {name: np.zeros(0, bool) for name in known.ends}
+
+    def experiment(self, do: Mapping[str, Any], n: int) -> None:
+        """Run an experiment, or observe, and keep the rows."""
+        found = _experiment(self.known.room, do, n)
+        n, self.turn = len(next(iter(found.values()))), self.turn + 1
+        self.rows = {name: np.append(self.rows[name], found[name]) for name in self.rows}
+        for name, was in self.is_set.items():
+            self.is_set[name] = np.append(was, np.full(n, name in do))
+
+    def columns(self, rows: Columns, is_set: Mapping[str, Any]) -> dict[str, Floats]:
+        """Return the columns of a regression, two for a variable, or one if they are values."""
+        found = dict[str, Floats]()
+        for name, (low, high) in self.known.ends.items():
+            if self.by_value:
+                found[name] = rows[name]
+            else:
+                share = (2.0 * rows[name] - low - high) / (high - low)
+                found[name] = np.where(is_set[name], share, 0.0)
+                found[f"set {name}"] = np.where(is_set[name], np.ones_like(share), 0.0)
+        return found
+
+    def under(self, do: Mapping[str, Any], n: int) -> dict[str, Floats]:
+        """Return columns of n rows under an intervention; all else is as where it was not set."""
+        others = [was for name, was in self.is_set.items() if name not in do]
+        every = np.arange(len(self.rows[self.outcomes[0]]))
+        free = every[~np.any(others, axis=0)] if others else every
+        at = np.resize(free if len(free) else every, n)
+        ends = {name: np.ravel(value) for name, value in do.items()}
+        drawn = {name: self.rng.uniform(end[0], end[-1], n) for name, end in ends.items()}
+        rows = {name: self.rows[name][at] for name in self.known.ends} | drawn
+        return self.columns(rows, {name: name in do for name in self.known.ends})
+
+    def causes(self, outcome: str, columns: Columns) -> list[str]:
+        """Return the columns that may explain an outcome."""
+        return [name for name in columns if name not in (outcome, f"set {outcome}")]
+
+    def free(self, outcome: str) -> Any:
+        """Return in which rows an outcome was not set."""
+        return ~self.is_set.get(outcome, np.zeros(len(self.rows[outcome]), bool))
+
+    def predict(self, outcome: str, dos: list[dict[str, float]]) -> Floats:
+        """Return the means of an outcome under interventions, by regression."""
+        kept, every = self.free(outcome), self.columns(self.rows, self.is_set)
+        columns = {name: column[kept] for name, column in every.items()}
+        fitted = _model(columns, self.causes(outcome, every), self.rows[outcome][kept])
+        return np.array([fitted(self.under(do, 40)).mean() for do in dos])
+
+    def unexplained(self, outcome: str, causes: list[str]) -> Floats:
+        """Return what causes leave of an outcome; the values that were set are instruments."""
+        free, y = self.free(outcome), self.rows[outcome]
+        one = np.ones((1, len(y)))
+        x = np.vstack([one, *(self.rows[c] for c in causes)])
+        z = np.vstack([one, *(np.where(self.is_set[c], self.rows[c], 0.0) for c in causes)])
+        weights = np.linalg.lstsq(z[:, free] @ x[:, free].T, z[:, free] @ y[free], rcond=None)[0]
+        return np.asarray(y - weights @ x)
+
+    def edges(self) -> list[list[str]]:
+        """Return the edges that ``do_order`` finds; none from a variable that was never set."""
+        # Noise that is never set makes do_order allow for hidden causes of all variables.
+        noise = self.rng.normal(size=len(self.rows[self.outcomes[0]]))
+        columns = self.rows if self.outcomes != self.known.readable else {**self.rows, "": noise}
+        names, table = [*columns], np.stack([*columns.values()], axis=1)
+        sets = np.stack([*self.is_set.values()], axis=1)
+        if len(table) < 3 or not sets.any():
+            return []
+        targets = [[n for n, one in zip(self.is_set, row, strict=True) if one] for row in sets]
+        data = Dataset.of(table, names, targets=targets)
+        # What cannot be set comes last in an episode.
+        ends = [
+            replace(c, how="value" if c.name in ("", *self.is_set) else "final")
+            for c in data.columns
+        ]
+        graph = do_order(replace(data, columns=tuple(ends)))
+        return [[a, b] for a, b, _ in graph.directed if b in self.outcomes]
+
+
+def _asked(seen: _Seen, query: Mapping[str, Any] | None) -> list[dict[str, float]]:
+    """Return the interventions under which an answer needs means of the outcome."""
+    known = seen.known
+    q, ends = query or {}, known.ends
+    match known.kind:
+        case "effect":
+            return [{q["cause"]: q[end]} for end in ("to", "from")]
+        case "law" | "control":
+            low, high = ends[q["cause"]]
+            places = np.linspace(low, high, GRID)
+            return [{**q["held"], q["cause"]: float(place)} for place in places]
+        case "counterfactual":
+            was = {c: float(np.clip(q["run"][c], *ends[c])) for c in ends}
+            was = was if known.independent else {q["cause"]: was[q["cause"]]}
+            return [{**was, q["cause"]: q["value"]}, was]
+        case "explanation":
+            return [{**q["set"], name: q["usual"][name]} for name in ends]
+        case "diagnosis":
+            shares = np.linspace(0.02, 0.98, 13)
+            tried = [(n, low + shares * (high - low)) for n, (low, high) in ends.items()]
+            return [{**q["usual"], n: float(x)} for n, many in tried for x in many]
+    points = [{n: float(seen.rng.uniform(*e)) for n, e in ends.items()} for _ in range(24)]
+    return list(q.get("dos", points))
+
+
+def _informative(seen: _Seen, n: int) -> dict[str, Any]:
+    """Return the experiment after which the predictions that are asked for vary least.
+
+    The surrogate is linear and Gaussian in constant, linear, square and cubic terms: with rows X,
+    n new rows Z and the terms C of what is asked, the sum of variances is trace(C (X'X + Z'Z +
+    r I)^-1 C') times that of a reading. An effect, or a counterfactual, asks for a difference.
+
+    Source:
+        Chaloner and Verdinelli, *Bayesian experimental design: a review*, Statistical Science
+        1995, section 2.2 (c- and A-optimality). For one number, the least variance is the largest
+        expected gain of information: MacKay, *Information-based objective functions for active
+        data selection*, Neural Computation 1992.
+    """
+    known, rng = seen.known, seen.rng
+    dos, names = _asked(seen, known.query), [*known.ends]
+    asked = [dos[i] for i in rng.permutation(len(dos))[:8]]
+    tried: list[dict[str, Any]] = [{}, *asked] if known.query else [{}]
+    for name, (low, high) in known.ends.items():
+        places = [[low, high], 0.8 * low + 0.2 * high, 0.2 * low + 0.8 * high]
+        tried += [{name: place} for place in places] + [known.others(name)]
+    tried += [{name: known.ends[name] for name in pair} for pair in combinations(names, 2)]
+    tried.append(known.others())
+    new = [seen.under(do, n) for do in tried]
+    wanted, rows = [seen.under(do, 8) for do in dos], seen.columns(seen.rows, seen.is_set)
+    outcomes = [known.query["outcome"]] if "outcome" in (known.query or {}) else seen.outcomes
+    costs = np.zeros(len(tried))
+    for outcome in outcomes if set(outcomes) & {*names} else outcomes[:1]:
+        causes = seen.causes(outcome, rows)
+        old = _terms({c: rows[c][seen.free(outcome)] for c in causes}, causes, 1)
+        c = np.stack([_terms(one, causes, 1).mean(axis=0) for one in wanted])
+        terms = [_terms(one, causes, 1) for one in new]
+        scale = np.maximum(np.abs(np.vstack([old, c, *terms])).max(axis=0), 1e-12)
+        c = c / scale - (c / scale).mean(axis=0) * (known.kind in ("effect", "counterfactual"))
+        before = (old / scale).T @ (old / scale) + PRIOR * np.eye(len(scale))
+        for i, (do, one) in enumerate(zip(tried, terms, strict=True)):
+            z = one / scale * (outcome not in do)
+            costs[i] += np.trace(c @ np.linalg.solve(before + z.T @ z, c.T))
+    return tried[int(np.argmin(costs))]
+
+
+def _next(design: str, seen: _Seen, n: int) -> dict[str, Any]:
+    """Return the next experiment of a design; values are drawn in the whole range."""
+    names, turn = [*seen.known.ends], seen.turn
+    every: list[tuple[str, ...]] = [(), *((name,) for name in names)]
+    match design:
+        case "random":
+            turn = int(seen.rng.integers(len(every))) if turn else 0
+        case "pairs":
+            every = [(), *combinations(names, 2)]
+        case "do_order" if turn >= len(every):
+            query, graph = seen.known.query or {}, nx.DiGraph(map(tuple, seen.edges()))
+            ends = [query["outcome"]] if "outcome" in query else seen.outcomes
+            found = {c for end in ends if end in graph for c in nx.ancestors(graph, end)}
+            every = [(name,) for name in names if name in found] or every
+        case "information" if turn:
+            return _informative(seen, n)
+    return {name: seen.known.ends[name] for name in every[turn % len(every)]}
+
+
+def _explore(design: str, room: Laboratory) -> None:
+    """Observe once, choose experiments until the budget is spent, and answer by regression."""
     known = _Known(room)
     seed = hashlib.sha256(json.dumps(known.about, sort_keys=True).encode()).digest()
-    rng = np.random.default_rng(int.from_bytes(seed[:8]))
-    for _ in range(5):
-        name = str(rng.choice([*known.ends]))
-        room.experiment({name: float(rng.uniform(*known.ends[name]))})
-    if known.query is None:  # it is asked when the budget is spent
-        while room.remaining:
-            room.observe(min(ROWS, room.remaining))
-    q = room.describe()["query"]
-    name = str(rng.choice([*known.ends]))
-    edges = [[a, b] for a in known.ends for b in known.readable if a != b and rng.random() < 0.3]
-    answers: dict[str, Any] = {
-        "graph": {"edges": edges},
-        "law": "0",
-        "prediction": [0.0] * len(q.get("dos", ())),
-        "control": {q.get("cause"): float(rng.uniform(*known.ends.get(q.get("cause"), (0, 1))))},
-        "explanation": name,
-        "diagnosis": name,
-    }
-    room.submit(answers.get(known.kind, float(rng.normal())), 0.2)
+    seen = _Seen(known, np.random.default_rng(int.from_bytes(seed[:8])))
+    n = -(-known.budget // ROUNDS)
+    while room.remaining:
+        now = min(n, room.remaining)
+        seen.experiment(_next(design, seen, now), now)
+    room.submit(_estimated(seen, room.describe()["query"]), 0.5)
 
 
-AGENTS: Mapping[str, Callable[[Laboratory], None]] = {"random": guess, "ideal": ideal}
+def _estimated(seen: _Seen, q: Mapping[str, Any]) -> Any:
+    """Return the answer from the rows; it is the same function of them for every design."""
+    kind, ends = seen.known.kind, seen.known.ends
+    if kind == "graph":
+        edges = [edge for edge in seen.edges() if edge not in q["known"]]
+        watched = ~np.any([*seen.is_set.values()], axis=0)
+        if seen.outcomes != seen.known.readable or np.sum(watched) < 8:
+            return {"edges": edges, "hidden": []}
+        left = {o: seen.unexplained(o, [c for c, e in edges if e == o]) for o in seen.outcomes}
+        return {"edges": edges, "hidden": _confounded({o: y[watched] for o, y in left.items()})}
+    dos = _asked(seen, q)
+    if kind == "diagnosis":
+        size = {o: float(np.std(seen.rows[o])) + 1e-12 for o in q["run"]}
+        apart = [(seen.predict(o, dos) - q["run"][o]) / size[o] for o in q["run"]]
+        errors = np.sum(np.square(apart), axis=0).reshape(len(ends), -1).min(axis=1)
+        return [*ends][int(np.argmin(errors))]
+    found = seen.predict(q["outcome"], dos)
+    match kind:
+        case "effect":
+            return float(found[0] - found[1])
+        case "counterfactual":
+            return float(q["run"][q["outcome"]] + found[0] - found[1])
+        case "prediction":
+            return found.tolist()
+        case "explanation":
+            sign = 1.0 if q["fails"] == "above" else -1.0
+            return [*ends][int(np.argmin(sign * found))]
+    low, high = ends[q["cause"]]
+    places = np.linspace(low, high, GRID)
+    if kind == "law":
+        return _curve(q["cause"], places, found)
+    grid = np.linspace(low, high, 2001)
+    near = np.argmin(np.abs(np.interp(grid, places, found) - q["target"]))
+    return {q["cause"]: float(grid[near])}
+
+
+DESIGNS = ("random", "one-at-a-time", "pairs", "do_order", "information")
+"""How agents choose experiments; the same estimator answers for all of them."""
+AGENTS: Mapping[str, Callable[[Laboratory], None]] = {
+    **{name: partial(_explore, name) for name in DESIGNS},
+    "ideal": ideal,
+}
 
 
 def play(agent: str, question: Question) -> Laboratory:

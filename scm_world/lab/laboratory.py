@@ -5,22 +5,28 @@ from __future__ import annotations
 import inspect
 import json
 import threading
+from base64 import b64encode
 from collections.abc import Callable, Iterable, Mapping
+from functools import reduce
 from os import PathLike
 from pathlib import Path
 from typing import Any, final
 
 from scm_world._arguments import one_of, real_number, typed, whole_number
+from scm_world.backends.renderer import automatic_camera, png, render, shapes_of
 from scm_world.errors import Forbidden, ModelError, ScmWorldError, UnknownOption, reading
 from scm_world.evaluation.statistics import Interval, mean_interval
 from scm_world.lab.questions import PASSED, Question
+from scm_world.models.shapes import Shapes
 from scm_world.queries.experiments.versions import versions
 from scm_world.runs.files import read_text, write_whole
 
 FORMAT = "scm_world/lab/1"
-TOOLS = ("describe", "observe", "experiment", "note", "submit")
-NOTES, LONGEST = 1000, 2000
-"""How many notes a run keeps, and characters of a note."""
+TOOLS = ("describe", "observe", "experiment", "look", "note", "submit")
+NOTES, LONGEST, LOOKS = 1000, 2000, 100
+"""How many notes a run keeps, characters of a note, and how many episodes are looked at."""
+SIZE = 240, 320
+"""Height and width of a picture [pixels]."""
 ROWS = 200
 """The most episodes of one call."""
 
@@ -46,6 +52,7 @@ class Laboratory:
             raise UnknownOption("question", question, ("a Question, as lab.question returns it",))
         self.question, self._view = question, question.view.fresh()
         self.spent, self.calls = 0, list[dict[str, Any]]()
+        self._shown = list[tuple[dict[str, Any], int, int]]()  # what was done, when, which unit
         self.score: dict[str, float] | None = None
         self._lock = threading.RLock()
 
@@ -79,6 +86,15 @@ class Laboratory:
         """
         arguments = {"do": do, "at": at, "n": n}
         return self._done("experiment", arguments, lambda: self._run(self._settings(do), at, n))
+
+    def look(self, episode: int, frames: int = 3) -> dict[str, Any]:
+        """Return pictures (PNG, base64) of an episode that was run, from its beginning to its end.
+
+        It costs no episode. Episodes are the rows of all readings so far, counted from 0. There are
+        pictures of worlds with bodies, at the levels L1 and L2: they would unmask names.
+        """
+        arguments = {"episode": episode, "frames": frames}
+        return self._done("look", arguments, lambda: self._seen(episode, frames))
 
     def note(self, text: str) -> dict[str, Any]:
         """Keep a remark in the record of the run; it is not scored."""
@@ -152,14 +168,34 @@ class Laboratory:
         at = whole_number("at", at, least=0, most=steps - 1)
         if n > self.remaining:
             raise Forbidden(f"run {n} more episodes", (f"{self.remaining} episodes",))
-        table = self._view.run(do, n, at)
+        table, first = self._view.run(do, n, at), self.spent
         self.spent += n
         keep = [*range(n)]
         if self._view.knobs.selection and not do:
             name = self._view.readable[0]
             keep = [i for i in keep if table[name][i] > self._view.middle[name]]
+        self._shown += [(do, at, first + i) for i in keep]
         columns = {name: [float(column[i]) for i in keep] for name, column in table.items()}
         return {"columns": columns, "remaining": self.remaining}
+
+    def _seen(self, episode: Any, frames: Any) -> dict[str, Any]:
+        level = self.question.level
+        if level not in ("L1", "L2") or self.question.world == "equations":
+            allowed = ("levels L1 and L2 of all worlds but equations",)
+            raise Forbidden(f"look at {self.question.world} at level {level}", allowed)
+        if not self._shown:
+            raise Forbidden("look at an episode before any was run", ("observe", "experiment"))
+        row = whole_number("episode", episode, least=0, most=len(self._shown) - 1)
+        steps = self._view.testbed.setting.get("steps", 1)
+        n = whole_number("frames", frames, least=2, most=steps + 1)
+        if sum(one["tool"] == "look" for one in self.calls) >= LOOKS:
+            raise Forbidden("look again", (f"{LOOKS} looks",))
+        run = self._view.episode(*self._shown[row])
+        times = [round(i * steps / (n - 1)) for i in range(n)]
+        scenes = [run.scene(step)[0] for step in times]
+        camera = automatic_camera(reduce(Shapes.joined, map(shapes_of, scenes)), SIZE)
+        taken = [png(render(scene, camera, samples=2).rgb) for scene in scenes]
+        return {"steps": times, "pictures": [b64encode(one).decode() for one in taken]}
 
     def _noted(self, text: Any) -> dict[str, Any]:
         if not isinstance(text, str) or len(text) > LONGEST:

@@ -93,8 +93,12 @@ def server(rooms: Laboratories) -> Any:
 
     async def called(tool: str, arguments: Mapping[str, Any] | None) -> Any:
         found = await asyncio.to_thread(rooms.call, tool, arguments or {})
-        text = [{"type": "text", "text": json.dumps(found, allow_nan=False)}]
-        result = {"content": text, "structuredContent": found, "isError": "refused" in found}
+        pictures = found.get("pictures", ())
+        found = {part: value for part, value in found.items() if part != "pictures"}
+        content = [{"type": "text", "text": json.dumps(found, allow_nan=False)}] + [
+            {"type": "image", "data": one, "mimeType": "image/png"} for one in pictures
+        ]
+        result = {"content": content, "structuredContent": found, "isError": "refused" in found}
         return types.CallToolResult.model_validate(result)
 
     async def tools_of(*_: Any) -> Any:

@@ -17,8 +17,8 @@ from scm_world._types import Floats
 from scm_world.discovery.metrics import evaluate as evaluate_graph
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.lab.expressions import FORM, evaluate
-from scm_world.lab.worlds import RIGS, WORLDS, Knobs, Testbed, testbed
-from scm_world.queries import Laboratory
+from scm_world.lab.worlds import RIGS, WORLDS, Knobs, Testbed, acted, testbed
+from scm_world.queries import Episode, Laboratory, Plan
 from scm_world.variables import Box, Draw, Hard
 
 LEVELS: Mapping[str, str] = {
@@ -31,6 +31,8 @@ PASSED, FAILED = 0.95, 0.2
 """A solver has at least the first score, and no trivial answer more than the second one."""
 DRAWS, PILOT = 40, 40
 """How many draws of a seed are tried, and units whose spread is that of a reading."""
+RUNS, CAUSES = 16, 5
+"""How many runs of a draw are tried, and the fewest causes of which one is an answer."""
 SHORTEST = 16
 """The fewest characters of a key."""
 
@@ -44,17 +46,22 @@ class Unusable(ModelError):
 
 @final
 class LevelView:
-    """An testbed under the names and scales of a level, with noise of its readings.
+    """A testbed under the names and scales of a level, with noise of its readings.
 
     Args:
         testbed: What can be set and read.
         level: A name of ``LEVELS``.
         knobs: Noise and selection.
         entropy: What all random numbers follow from.
+        lot: A number in [0, 1), the same for all draws of a seed: it decides answers that are
+            names.
     """
 
-    def __init__(self, testbed: Testbed, level: str, knobs: Knobs, entropy: int) -> None:
+    def __init__(
+        self, testbed: Testbed, level: str, knobs: Knobs, entropy: int, lot: float = 0.0
+    ) -> None:
         self.testbed, self.level, self.knobs, self.entropy = testbed, level, knobs, entropy
+        self.lot = lot
         rng = np.random.default_rng([entropy, 1])
         n, masked = len(testbed.quantities), level in ("L3", "L4")
         order = rng.permutation(n) if level == "L4" else np.arange(n)
@@ -133,50 +140,36 @@ class LevelView:
     # --- experiments ----------------------------------------------------------------------------
 
     def run(self, do: Mapping[str, Any], n: int, at: int = 0) -> dict[str, Floats]:
-        """Run episodes of the agent; return noisy readings."""
+        """Run episodes of the agent; return readings, whose noise depends on the episode only."""
         room = self._room(False)
-        first = room.spent
-        samples = room.do(self.plan(do, at), n) if do else room.see(n)
-        return self.noisy(self._table(samples), first)
-
-    def noisy(self, table: dict[str, Floats], first: int) -> dict[str, Floats]:
-        """Add the noise of readings; that of an episode depends on its number only."""
-        n, noise = len(next(iter(table.values()))), self.knobs.noise
-        drawn = np.array(
-            [
-                np.random.default_rng([self.entropy, 2, first + i]).normal(size=len(table))
-                for i in range(n)
-            ]
-        )
+        rngs = [np.random.default_rng([self.entropy, 2, room.spent + i]) for i in range(n)]
+        table = self._table(room.do(self.plan(do, at), n) if do else room.see(n))
+        drawn = self.knobs.noise * np.array([rng.normal(size=len(table)) for rng in rngs])
         return {
-            name: column + noise * self.spread[name] * drawn[:, i]
+            name: column + self.spread[name] * drawn[:, i]
             for i, (name, column) in enumerate(table.items())
         }
 
+    def episode(self, do: Mapping[str, Any], at: int, unit: int) -> Episode:
+        """Repeat an episode of the agent, by its number."""
+        setting = dict(self.testbed.setting)
+        plan = Plan(self.plan(do, at)).over(setting.pop("nature", None), "nature")
+        seed = self.entropy % 2**62
+        return self.testbed.world.rollout(do=plan, seed=seed, episode=unit, **setting)
+
     # --- answers --------------------------------------------------------------------------------
+
+    def held_out(self, do: Mapping[str, Any], n: int) -> dict[str, Floats]:
+        """Return readings of units that no agent has; the same at each intervention."""
+        wanted, seed = [self.quantities[name].reads for name in self.readable], self.entropy + 2
+        how: dict[str, Any] = {"outcomes": wanted, "seed": seed % 2**62, **self.testbed.setting}
+        return self._table(self.testbed.world.sample(n, self.plan(do), **how))
 
     def means(self, do: Mapping[str, Any]) -> dict[str, float]:
         """Return the mean of each reading under an intervention, over held-out units."""
-        world, setting = self.testbed.world, self.testbed.setting
-        wanted = [self.quantities[name].reads for name in self.readable]
-        seed = (self.entropy + 2) % 2**62
         fixed = {n for n, one in self.quantities.items() if one.sets} <= {*do}
         n = 1 if fixed and self.testbed.independent else self.testbed.truth
-        found = world.sample(n, self.plan(do), outcomes=wanted, seed=seed, **setting)
-        return {name: float(column.mean()) for name, column in self._table(found).items()}
-
-    def effect(self, outcome: str, cause: str, ends: Sequence[float]) -> Any:
-        """Return the average effect of a change of a cause, on the scale of the level."""
-        scale, _ = self._affine[outcome]
-        found = self.testbed.world.effect(
-            self.quantities[outcome].reads,
-            do=self.plan({cause: ends[1]}),
-            versus=self.plan({cause: ends[0]}),
-            n=self.testbed.truth,
-            seed=(self.entropy + 2) % 2**62,
-            **self.testbed.setting,
-        )
-        return scale * float(found.mean)
+        return {name: float(column.mean()) for name, column in self.held_out(do, n).items()}
 
     def unit(
         self, do: Mapping[str, Any]
@@ -260,13 +253,25 @@ def _inside(view: LevelView, name: str, share: float) -> float:
 
 def _graph(view: LevelView, rng: np.random.Generator) -> Query:
     made, shown = view.testbed, view.names
-    edges = sorted([shown[c], shown[e]] for c, e in made.edges)
+    text = "Which variables act directly on which, and which pairs have a hidden common cause?"
+    true, query = made.edges, dict[str, Any]()
+    if made.local:
+        drawn = {name: _inside(view, name, rng.uniform(0.05, 0.95)) for name in _usual(view)}
+        true, query = acted(made, view.plan(drawn)), {"set": drawn}
+        for name, step in ((n, s) for n in drawn for s in (-0.04, 0.04)):
+            apart = {**drawn, name: drawn[name] + step * float(np.diff(view.ends(name))[0])}
+            if acted(made, view.plan(apart)) != true:
+                raise Unusable(["a small change makes or breaks a touch"])
+        text = (
+            "In a run all variables are set as below. Which of them acted on which outcomes in "
+            "this very run, so that an outcome were another if a variable was set slightly apart?"
+        )
+    edges = sorted([shown[c], shown[e]] for c, e in true)
     hidden = sorted(sorted((shown[a], shown[b])) for a, b in made.confounded)
     own = sorted([shown[c], shown[e]] for c, e in made.own)
     if not edges:
         raise Unusable(["no edge"])
-    text = "Which variables act directly on which, and which pairs have a hidden common cause?"
-    return Query(text, {"known": own}, {"edges": edges, "hidden": hidden})
+    return Query(text, {**query, "known": own}, {"edges": edges, "hidden": hidden})
 
 
 def _grade_graph(answer: Any, question: Question) -> float:
@@ -298,7 +303,8 @@ def graph_pairs(answer: Any, part: str, names: Sequence[str]) -> list[tuple[str,
 def _effect(view: LevelView, rng: np.random.Generator) -> Query:
     cause, outcome = _pair(view, rng)
     ends = [_inside(view, cause, share) for share in (0.2, 0.8)]
-    answer = view.effect(outcome, cause, ends)
+    low, high = (view.means({cause: end})[outcome] for end in ends)
+    answer = high - low
     if abs(answer) < 0.3 * view.spread[outcome]:
         raise Unusable(["the effect is within the noise"])
     text = (
@@ -313,20 +319,27 @@ def _effect(view: LevelView, rng: np.random.Generator) -> Query:
     )
 
 
-def _held(view: LevelView, cause: str) -> tuple[dict[str, float], str]:
-    """Return what a question about one cause holds: all others, if none acts on another."""
-    if not view.testbed.independent:
-        return {}, ""
-    return {
-        n: v for n, v in _usual(view).items() if n != cause
-    }, ", all others at their usual value"
+def _along(view: LevelView, cause: str, outcome: str) -> tuple[Any, dict[str, float], str]:
+    """Return the outcome's mean by share of the cause's range, and what is held meanwhile.
+
+    All others are held, if none acts on another.
+    """
+    held, words = dict[str, float](), ""
+    if view.testbed.independent:
+        held = {name: value for name, value in _usual(view).items() if name != cause}
+        words = ", all others at their usual value"
+
+    def reached(share: float) -> float:
+        return view.means({**held, cause: _inside(view, cause, share)})[outcome]
+
+    return reached, held, words
 
 
 def _law(view: LevelView, rng: np.random.Generator) -> Query:
     cause, outcome = _pair(view, rng)
-    held, words = _held(view, cause)
-    places = [_inside(view, cause, share) for share in np.linspace(0.03, 0.97, 13)]
-    found = [view.means({**held, cause: place})[outcome] for place in places]
+    reached, held, words = _along(view, cause, outcome)
+    shares = np.linspace(0.03, 0.97, 13)
+    found, places = [*map(reached, shares)], [_inside(view, cause, share) for share in shares]
     if np.std(found) < 0.2 * view.spread[outcome]:
         raise Unusable(["the law is within the noise"])
     text = (
@@ -352,15 +365,8 @@ def _prediction(view: LevelView, rng: np.random.Generator) -> Query:
     causes = [name for name in _usual(view) if name != outcome]
     dos = [{n: _inside(view, n, rng.uniform(0.1, 0.9)) for n in causes} for _ in range(4)]
     found = [view.means(do)[outcome] for do in dos]
-    everything = {name: view.ends(name) for name in causes}
-    spread = view.testbed.world.sample(
-        40,
-        view.plan(everything),
-        outcomes=[view.quantities[outcome].reads],
-        seed=(view.entropy + 2) % 2**62,
-        **view.testbed.setting,
-    )
-    size = abs(view._affine[outcome][0]) * float(np.std(next(iter(spread.values()))))
+    drawn = view.held_out({name: view.ends(name) for name in causes}, PILOT)[outcome]
+    size = float(np.std(drawn))
     if np.ptp(found) < 0.8 * size:
         raise Unusable(["all answers are alike"])
     return Query(
@@ -371,15 +377,12 @@ def _prediction(view: LevelView, rng: np.random.Generator) -> Query:
     )
 
 
-def _numbers(answer: Any, n: int) -> Floats:
+def _grade_prediction(answer: Any, question: Question) -> float:
+    n = len(question.answer)
     if not isinstance(answer, list | tuple) or len(answer) != n:
         raise UnknownOption("answer", answer, (f"a list of {n} numbers",))
-    return np.array([real_number("answer", one) for one in answer])
-
-
-def _grade_prediction(answer: Any, question: Question) -> float:
-    errors = np.abs(_numbers(answer, len(question.answer)) - question.answer)
-    return near(float(errors.max()), question.scale)
+    errors = np.array([real_number("answer", one) for one in answer]) - question.answer
+    return near(float(np.abs(errors).max()), question.scale)
 
 
 def _counterfactual(view: LevelView, rng: np.random.Generator) -> Query:
@@ -409,11 +412,7 @@ def _grade_number(answer: Any, question: Question) -> float:
 def _control(view: LevelView, rng: np.random.Generator) -> Query:
     """Draw a target that is uniform in the outcome's range, so that no constant value is likely."""
     cause, outcome = _pair(view, rng)
-    held, words = _held(view, cause)
-
-    def reached(share: float) -> float:
-        return view.means({**held, cause: _inside(view, cause, share)})[outcome]
-
+    reached, held, words = _along(view, cause, outcome)
     if np.ptp([reached(share) for share in (0.02, 0.5, 0.98)]) < 0.4 * view.spread[outcome]:
         raise Unusable(["the outcome hardly follows"])
     shares, fine = np.linspace(0.02, 0.98, 13), np.linspace(0.02, 0.98, 1001)
@@ -445,45 +444,55 @@ def _usual(view: LevelView) -> dict[str, float]:
     }
 
 
+def _target(view: LevelView) -> str:
+    """Return the answer that is a name; a seed draws it, before all else, from all causes alike."""
+    if len(view.testbed.causes) < CAUSES:
+        raise ModelError([f"names would be guessed: there are fewer than {CAUSES} causes"])
+    return view.names[view.testbed.causes[int(view.lot * len(view.testbed.causes))]]
+
+
 def _explanation(view: LevelView, rng: np.random.Generator) -> Query:
-    _, outcome = _pair(view, rng)
-    usual, size = _usual(view), view.spread[outcome]
-    for _ in range(8):
+    """Draw runs until the target decides an outcome, and nothing else does."""
+    cause, usual = _target(view), _usual(view)
+    for _ in range(RUNS):
         far = rng.uniform(0.2, 0.45)  # the same for all, so that distances tell nothing
         drawn = {name: _inside(view, name, 0.5 + far * rng.choice([-1, 1])) for name in usual}
         run, other = view.unit(drawn)
-        apart = {name: run[outcome] - other({name: usual[name]})[outcome] for name in usual}
-        sign = max((1.0, -1.0), key=lambda sign: max(sign * one for one in apart.values()))
-        second, most = sorted(sign * one for one in apart.values())[-2:]
-        if most - max(second, 0.0) > 0.3 * size:
-            break
-    else:
-        raise Unusable(["no single cause"])
-    cause = max(apart, key=lambda name: sign * apart[name])
-    limit = run[outcome] - 0.5 * sign * (most + max(second, 0.0))
-    word = "above" if sign > 0 else "below"
-    text = (
-        f"In the run below {outcome} ended {word} {limit:.6g}: it failed. Which one of the "
-        "variables decided that: had it been set to its usual value, the run would not have failed?"
-    )
-    seen = {name: run[name] for name in run if not view.quantities[name].sets}
-    query = {"outcome": outcome, "limit": limit, "fails": word, "set": drawn, "usual": usual}
-    return Query(text, query | {"run": seen}, cause)
+        without = {name: other({name: usual[name]}) for name in usual}
+        for i in rng.permutation(len(view.testbed.outcomes)):
+            outcome = view.names[view.testbed.outcomes[i].name]
+            apart = {name: run[outcome] - seen[outcome] for name, seen in without.items()}
+            sign, most = np.sign(apart[cause]), abs(apart.pop(cause))
+            second = max(0.0, *(sign * one for one in apart.values()))
+            if most - second > 0.3 * view.spread[outcome]:
+                limit = float(run[outcome] - 0.5 * sign * (most + second))
+                word = "above" if sign > 0 else "below"
+                query = {"outcome": outcome, "limit": limit, "fails": word, "set": drawn}
+                seen = {name: run[name] for name in run if not view.quantities[name].sets}
+                text = (
+                    f"In the run below {outcome} ended {word} {limit:.6g}: it failed. Which one of "
+                    "the variables decided that: had it been set to its usual value, the run would "
+                    "not have failed?"
+                )
+                return Query(text, {**query, "usual": usual, "run": seen}, cause)
+    raise Unusable([f"in none of {RUNS} runs the cause that was drawn decides"])
 
 
 def _diagnosis(view: LevelView, rng: np.random.Generator) -> Query:
-    usual = _usual(view)
-    cause = str(rng.choice([*usual]))
-    value = _inside(view, cause, float(rng.choice([0.08, 0.92])))
-    run, _ = view.unit({**usual, cause: value})
-    still, _ = view.unit(usual)
-    outcomes = [name for name in run if not view.quantities[name].sets]
-    moved = [abs(run[n] - still[n]) / view.spread[n] for n in outcomes if view.spread[n]]
-    if max(moved) < 0.5:
-        raise Unusable(["nothing is seen of it"])
-    text = "In the recording below one of the variables was not at its usual value. Which one?"
-    seen = {name: run[name] for name in outcomes}
-    return Query(text, {"usual": usual, "run": seen}, cause)
+    """Draw usual values until a deviation of the target is seen."""
+    cause = _target(view)
+    for _ in range(RUNS):
+        usual = {name: _inside(view, name, rng.uniform(0.3, 0.7)) for name in _usual(view)}
+        value = _inside(view, cause, float(rng.choice([0.08, 0.92])))
+        (run, _), (still, _) = view.unit({**usual, cause: value}), view.unit(usual)
+        seen = {name: one for name, one in run.items() if not view.quantities[name].sets}
+        moved = [abs(seen[n] - still[n]) / view.spread[n] for n in seen if view.spread[n]]
+        if max(moved) >= 0.5:
+            text = (
+                "In the recording below one of the variables was not at its usual value. Which one?"
+            )
+            return Query(text, {"usual": usual, "run": seen}, cause)
+    raise Unusable([f"in none of {RUNS} recordings the deviation is seen"])
 
 
 def _grade_name(answer: Any, question: Question) -> float:
@@ -522,16 +531,18 @@ KINDS: Mapping[str, Kind] = {
     ),
 }
 FILES = (".xml", ".urdf", ".mjcf")
+SPEC = ("kind", "world", "seed", "level", "knobs", "draw")
+"""The parts of a ``Question.spec``."""
 
 
 def offers(kind: str) -> tuple[str, ...]:
     """Return the worlds that have questions of a kind; model files have all but ``"graph"``."""
     one_of("kind", kind, tuple(KINDS))
     if kind == "graph":
-        return "equations", "servo", "network"
+        return "equations", "servo", "network", "row"
     if kind in ("explanation", "diagnosis"):
         return tuple(RIGS)
-    without = ("network", "boxes") if kind == "law" else ("network",)  # a touch is no expression
+    without = ("network", "row", *(("boxes",) if kind == "law" else ()))  # a touch is no expression
     return tuple(world for world in WORLDS if world not in without)
 
 
@@ -581,23 +592,14 @@ class Question:
             UnknownOption: A part of it does not exist.
             ModelError: The draw makes no question.
         """
-        names = ("kind", "world", "seed", "level", "knobs", "draw")
-        if not isinstance(spec, Mapping) or {*spec} != {*names}:
-            raise UnknownOption("spec", spec, names)
-        kind, world, seed, level, knobs, draw = (spec[name] for name in names)
-        return build(kind, world, seed, level, Knobs(**knobs), draw, key)
+        if not isinstance(spec, Mapping) or {*spec} != {*SPEC}:
+            raise UnknownOption("spec", spec, SPEC)
+        return build(**{**spec, "knobs": Knobs(**spec["knobs"])}, key=key)
 
     @property
     def spec(self) -> dict[str, Any]:
         """What the question is made of again, without its key."""
-        return {
-            "kind": self.kind,
-            "world": self.world,
-            "seed": self.seed,
-            "level": self.level,
-            "knobs": asdict(self.knobs),
-            "draw": self.draw,
-        }
+        return {name: getattr(self, name) for name in SPEC} | {"knobs": asdict(self.knobs)}
 
     @property
     def late(self) -> bool:
@@ -657,7 +659,7 @@ def build(
 ) -> Question:
     """Build a draw of a question, which is not certified.
 
-    Its random numbers follow from an HMAC-SHA256 of kind, world, knobs, seed and draw under the
+    Its random numbers follow from an HMAC-SHA256 of kind, world, seed, draw and knobs under the
     key, so that nobody without the key can make it.
     """
     is_file = kind != "graph" and isinstance(world, str) and world.endswith(FILES)
@@ -666,26 +668,17 @@ def build(
     one_of("level", level, tuple(LEVELS))
     seed, draw = whole_number("seed", seed, least=0), whole_number("draw", draw, least=0)
     check_key(key)
-    identity = json.dumps([kind, world, seed, draw, asdict(knobs)])
-    hashed = hmac.new((key or "").encode(), identity.encode(), hashlib.sha256).digest()
-    entropy = int.from_bytes(hashed[:7], "big")
+    secret, same, hard = (key or "").encode(), (kind, world, seed), asdict(knobs)
+
+    def hashed(*parts: Any) -> int:
+        found = hmac.new(secret, json.dumps(parts).encode(), hashlib.sha256)
+        return int.from_bytes(found.digest()[:7], "big")
+
+    entropy, lot = hashed(*same, draw, hard), hashed(*same, hard) / 256**7
     rng = np.random.default_rng([entropy, 0])
-    view = LevelView(testbed(world, rng, knobs), level, knobs, entropy)
-    found = KINDS[kind].make(view, rng)
-    return Question(
-        kind,
-        world,
-        seed,
-        level,
-        knobs,
-        draw,
-        view,
-        found.text,
-        found.query,
-        found.answer,
-        found.scale,
-        hmac.new((key or "").encode(), b"digest", hashlib.sha256).digest(),
-    )
+    view = LevelView(testbed(world, rng, knobs), level, knobs, entropy, lot)
+    seal = hmac.new(secret, b"digest", hashlib.sha256).digest()
+    return Question(kind, world, seed, level, knobs, draw, view, *KINDS[kind].make(view, rng), seal)
 
 
 @typed
@@ -728,12 +721,11 @@ def question(
             rejected.append(str(error))
             continue
         scores = certify(plain)
-        trivial = max(scores["trivial"].values())
-        if scores["solver"] >= PASSED and trivial <= FAILED:
+        best = max(scores["trivial"].values(), default=None)
+        if best is not None and best <= FAILED:
             found = plain if level == "L2" else build(kind, world, seed, level, settings, draw, key)
             certificate = {**scores, "rejected": rejected}
             return Question(**{**vars(found), "certificate": certificate})
-        rejected.append(
-            f"the solver has {scores['solver']:.2f}, and a trivial answer {trivial:.2f}"
-        )
+        why = f"the solver has {scores['solver']:.2f}"
+        rejected.append(why if best is None else f"a trivial answer has {best:.2f}")
     raise Unusable([f"none of {DRAWS} draws of seed {seed} is a question: {rejected[-1]}"])

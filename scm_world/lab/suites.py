@@ -10,7 +10,6 @@ import hashlib
 import hmac
 import io
 import json
-import shutil
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -18,7 +17,7 @@ from functools import partial
 from importlib import metadata, resources
 from typing import TYPE_CHECKING, Any, NamedTuple, cast, final
 
-from scm_world._arguments import one_of, typed
+from scm_world._arguments import one_of, real_number, typed
 from scm_world.discovery.data import Dataset, as_frame, as_huggingface, collect, load, save
 from scm_world.discovery.problems import TaskView, problem
 from scm_world.errors import ModelError, ScmWorldError, UnknownOption, reading
@@ -34,7 +33,7 @@ from scm_world.lab.questions import (
 )
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
-from scm_world.runs.files import Location, is_there, located, read_bytes, write_whole
+from scm_world.runs.files import Location, located, read_bytes, remove, write_whole
 from scm_world.runs.pool import Pool, pool_of
 from scm_world.runs.study import Study
 from scm_world.tasks import ModelTask
@@ -171,7 +170,11 @@ class Suite:
         progress: Progress | None,
     ) -> dict[str, dict[str, Any]]:
         """Make parts, or read those that are in the folder; return what is known of each."""
-        recipes = {name: _recipe(recipe) for name, recipe in self.manifest["parts"].items()}
+        known = ("sha256", "trivial", "skipped")  # afterwards: they decide nothing
+        recipes = {
+            name: {what: one for what, one in recipe.items() if what not in known}
+            for name, recipe in self.manifest["parts"].items()
+        }
         settings = {"suite": self.name, "recipes": recipes, "versions": _here()}
         cells = {f"{name}.json": (name, recipe) for name, recipe in parts.items()}
         work, read = partial(_part, folder, key), partial(_checked, folder, key)
@@ -212,7 +215,8 @@ class Suite:
             the best mean score of a trivial answer.
 
         Raises:
-            UnknownOption: A column is missing, an id is not of this suite, or two rows have one.
+            UnknownOption: A column is missing, an id is not of this suite, two rows have one, or a
+                confidence is no number in [0, 1].
         """
         import pandas
 
@@ -228,19 +232,19 @@ class Suite:
         ]
         with pool_of(engine, workers) as pool:
             graded = {i: s for _, part in pool.run(partial(_graded, key), jobs) for i, s in part}
-        rows = [
-            {
-                "kind": recipe["kind"],
-                "level": _level(recipe, number),
-                "score": graded.get(i) or 0.0,
-                "answered": i in given,
-                "refused": i in given and graded[i] is None,
-                "brier": _brier(given.get(i, (None, None))[1], graded.get(i)),
-                **{f"trivial {n}": s for n, s in recipe.get("trivial", {}).items()},
-            }
-            for name, recipe in parts.items()
-            for number, i in enumerate(_ids(name, recipe))
-        ]
+        rows = []
+        for name, recipe in parts.items():
+            trivial = {f"trivial {n}": s for n, s in recipe.get("trivial", {}).items()}
+            for number, i in enumerate(_ids(name, recipe)):
+                (_, sure), score = given.get(i, (None, None)), graded.get(i)
+                row = {
+                    "kind": recipe["kind"],
+                    "level": _level(recipe, number),
+                    "answered": i in given,
+                }
+                row |= {"score": score or 0.0, "refused": i in given and score is None}
+                row["brier"] = None if sure is None or score is None else brier(sure, score)
+                rows.append({**row, **trivial})
         return _summary(pandas.DataFrame(rows))
 
     @property
@@ -267,13 +271,6 @@ def _here() -> dict[str, str]:
 # --- parts ----------------------------------------------------------------------------------------
 
 
-def _recipe(recipe: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what decides a part, without what is known of it afterwards."""
-    return {
-        name: one for name, one in recipe.items() if name not in ("sha256", "trivial", "skipped")
-    }
-
-
 def _ids(name: str, recipe: Mapping[str, Any]) -> list[str]:
     """Return the ids of the questions of a part; a table is one question."""
     return [name] if "source" in recipe else [f"{name}-{i:03d}" for i in range(recipe["n"])]
@@ -292,9 +289,10 @@ def _part(
         table, about = _table(recipe)
         frame = as_frame(table)
         if folder is not None:
-            if is_there(folder / name):  # of a process that was killed
-                shutil.rmtree(str(folder / name))
-            save(table, folder / name)
+            place = folder / name
+            for file in place.iterdir() if place.is_dir() else ():  # of a process that was killed
+                remove(file)
+            save(table, place)
     else:
         frame, about = _questions(name, recipe, key)
         if folder is not None:
@@ -443,6 +441,8 @@ def _frame(path: Location) -> pandas.DataFrame:
 
 def _answers(table: pandas.DataFrame, known: set[str]) -> dict[str, tuple[Any, Any]]:
     """Return the answer and the confidence by the id of their question."""
+    import pandas
+
     for column in (ID, ANSWER):
         one_of("column of answers", column, [*table])
     found = dict[str, tuple[Any, Any]]()
@@ -451,11 +451,13 @@ def _answers(table: pandas.DataFrame, known: set[str]) -> dict[str, tuple[Any, A
         one_of("question", i, sorted(known))
         if i in found:
             raise UnknownOption("question", i, ("one row for each question",))
+        if known_sure := not pandas.isna(confidence):
+            real_number(f"confidence of question {i}", confidence, least=0.0, most=1.0)
         answer = given
         if isinstance(given, str):
             with suppress(ValueError):  # a law or a name without quotes
                 answer = json.loads(given)
-        found[i] = answer, confidence
+        found[i] = answer, float(confidence) if known_sure else None
     return found
 
 
@@ -487,12 +489,6 @@ def _overlap(answer: Any, about: Mapping[str, Any]) -> float:
     found |= {frozenset(pair) for pair in graph_pairs(answer, "hidden", about["names"])}
     true = {*map(tuple, about["edges"]), *map(frozenset, about["hidden"])}
     return 2.0 * len(found & true) / max(len(found) + len(true), 1)
-
-
-def _brier(confidence: Any, score: float | None) -> float | None:
-    if confidence is None or score is None or not 0.0 <= confidence <= 1.0:
-        return None
-    return brier(confidence, score)
 
 
 def _summary(rows: pandas.DataFrame) -> pandas.DataFrame:

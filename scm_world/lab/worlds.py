@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from types import MappingProxyType
 from typing import Any, NamedTuple, final
@@ -73,6 +73,7 @@ class Testbed:
         edges: True edges between quantities, and pairs with a hidden common cause.
         confounded: Pairs with a hidden common cause.
         own: Edges that the question states.
+        local: Whether the graph is that of a given run, with edges that act only by contact.
         doc: What the world is, for the level L1.
     """
 
@@ -86,11 +87,18 @@ class Testbed:
     edges: tuple[Edge, ...] = ()
     confounded: tuple[Edge, ...] = ()
     own: tuple[Edge, ...] = ()
+    local: bool = False
 
     @property
     def settable(self) -> tuple[LabVariable, ...]:
         """The quantities that may be set."""
         return tuple(one for one in self.quantities if one.sets)
+
+    @property
+    def causes(self) -> tuple[str, ...]:
+        """The names of the settable quantities that act on something."""
+        acting = {cause for cause, _ in (*self.edges, *self.own)}
+        return tuple(one.name for one in self.settable if one.name in acting)
 
     @property
     def outcomes(self) -> tuple[LabVariable, ...]:
@@ -303,9 +311,10 @@ def _laws(law: str, k: Floats, stiffness: float, damping: float) -> str:
 
 
 def _body(name: str, at: str, joint: str, geom: str) -> str:
+    color = "0.8 0.3 0.2 1" if name in ("left", "first") else "0.2 0.4 0.8 1"
     return (
-        f'<body name="{name}" pos="{at}"><joint name="{name}" {joint}/><geom name="{name}" {geom}/>'
-        "</body>"
+        f'<body name="{name}" pos="{at}"><joint name="{name}" {joint}/>'
+        f'<geom name="{name}" rgba="{color}" {geom}/></body>'
     )
 
 
@@ -367,6 +376,27 @@ conaffinity="0"/></body>"""
     return _model(0.01, body.replace("</body>", f"{pole}</body>"), motor, "0 0 -9.81")
 
 
+def _pushing(law: str, k: Floats) -> str:
+    shape, slide = 'type="box" size="0.05 0.05 0.05" mass="0.5"', 'type="slide" axis'
+    ways = {"x": f'{slide}="1 0 0"', "y": f'{slide}="0 1 0"', "z": f'{slide}="0 0 1"'}
+    ways["turn"] = 'axis="0 0 1"'  # a block on the floor, which cannot tip over
+    blocks = "".join(
+        f'<body name="{name}" pos="{x:.4f} {y} 0.05"><geom name="{name}" {shape} friction="0.3" '
+        f'rgba="{color}"/>'
+        + "".join(f'<joint name="{name}_{way}" {joint}/>' for way, joint in ways.items())
+        + "</body>"
+        for name, x, y, color in (
+            ("block", 0.0, 0.0, "0.2 0.4 0.8 1"),
+            ("other", 0.3 * k[0], 0.07, "0.2 0.6 0.3 1"),
+        )
+    )
+    pusher = f"""<body name="pusher" pos="-0.3 0 0.05"><joint name="pusher" {SLIDE}
+{_laws(law, k, 0.0, 0.5)}/><joint name="offset" axis="0 1 0" type="slide" damping="100"/>
+<geom name="pusher" rgba="0.8 0.3 0.2 1" size="0.04" mass="0.5" friction="0.3"/></body>"""
+    floor = '<geom name="floor" type="plane" size="3 3 0.1" friction="0"/>'
+    return _model(0.005, floor + pusher + blocks, gravity="0 0 -9.81")
+
+
 MASS, SPEED = ("kg", 0.2, 1.5), ("m/s", 0.3, 2.0)
 RIGS: Mapping[str, Rig] = {
     "springs": Rig(
@@ -375,6 +405,7 @@ RIGS: Mapping[str, Rig] = {
             **{f"{side}.mass": MASS for side in ("left", "right")},
             "spring.stiffness": ("N/m", 1.0, 9.0),
             **{f"{side}.velocity": SPEED for side in ("left", "right")},
+            "left.position": ("m", -0.3, 0.3),
         },
         {"left.position": "m", "right.position": "m"},
         1.2,
@@ -387,6 +418,7 @@ RIGS: Mapping[str, Rig] = {
             "beam.stiffness": ("N m/rad", 4.0, 12.0),
             "beam.damping": ("N m s/rad", 0.2, 2.0),
             "beam.velocity": ("rad/s", -2.0, 2.0),
+            "beam.position": ("rad", -0.3, 0.3),
         },
         {"beam.position": "rad", "beam.velocity": "rad/s"},
         1.0,
@@ -397,6 +429,7 @@ RIGS: Mapping[str, Rig] = {
         {
             **{f"{box}.mass": MASS for box in ("first", "second")},
             "first.velocity": ("m/s", 0.3, 2.5),
+            "second.velocity": ("m/s", -0.5, 0.5),
             **{f"{box}.damping": ("N s/m", 0.1, 1.5) for box in ("first", "second")},
         },
         {"first.position": "m", "second.position": "m"},
@@ -411,10 +444,24 @@ RIGS: Mapping[str, Rig] = {
             "across.velocity": ("m/s", -0.6, 0.6),
             "down.velocity": ("m/s", -1.0, 1.0),
             "across.damping": ("N s/m", 0.0, 1.0),
+            "down.damping": ("N s/m", 0.0, 2.0),
         },
         {"across.position": "m", "down.position": "m"},
         0.6,
         "A ball falls into a funnel.",
+    ),
+    "pushing": Rig(
+        _pushing,
+        {
+            **{f"{body}.mass": ("kg", 0.4, 1.2) for body in ("pusher", "block")},
+            "block.friction": ("1", 0.2, 0.6),
+            "pusher.velocity": ("m/s", 1.5, 3.0),
+            "offset.position": ("m", 0.01, 0.035),
+            "pusher.damping": ("N s/m", 0.1, 3.0),
+        },
+        {"block_x.position": "m", "block_turn.position": "rad"},
+        1.2,
+        "A pusher strikes a block on the floor, off its middle; it slides, and may hit another.",
     ),
     "cartpole": Rig(
         _cartpole,
@@ -424,6 +471,7 @@ RIGS: Mapping[str, Rig] = {
             "cart.damping": ("N s/m", 0.1, 4.0),
             "pole.position": ("rad", -0.25, 0.25),
             "cart.velocity": ("m/s", -0.6, 0.6),
+            "pole.velocity": ("rad/s", -0.5, 0.5),
         },
         {"cart.position": "m", "pole.position": "rad"},
         1.2,
@@ -499,9 +547,57 @@ def rig(made: Rig, rng: np.random.Generator, knobs: Knobs) -> Testbed:
         World(task).given(follows),
         tuple(quantities),
         {"policy": None, "steps": made.steps},
-        64,
+        128,
         f"{made.doc} {LAWS[knobs.law].capitalize()}.",
         edges=tuple((cause, f"{what}.{how}") for cause in made.causes for what, how in outcomes),
+    )
+
+
+def row(rng: np.random.Generator, knobs: Knobs) -> Testbed:
+    """Make boxes on a rail, each with a speed; they act on one another only while they touch."""
+    n = max(4, knobs.variables - 1)
+    names = [f"box{i}" for i in rng.permutation(n)]
+    shape = 'type="box" size="0.05 0.05 0.05" friction="0" solref="0.03 0.5"'
+    gaps, masses = rng.uniform(0.15, 0.4, n), rng.uniform(0.4, 0.8, n)
+    bodies = "".join(
+        _body(name, f"{x:.4f} 0 0", f'{SLIDE} damping="0.3"', f'{shape} mass="{mass:.4f}"')
+        for name, x, mass in zip(names, np.cumsum(gaps), masses, strict=True)
+    )
+    made = Rig(
+        lambda _law, _k: _model(0.005, bodies),
+        {f"{name}.velocity": ("m/s", -1.2, 1.2) for name in sorted(names)},
+        dict.fromkeys((f"{name}.position" for name in sorted(names)), "m"),
+        1.2,
+        "Boxes slide on a rail; they act on one another only while they touch.",
+        24,
+    )
+    bed = rig(made, rng, replace(knobs, law="plain"))
+    kept = tuple(one for one in bed.quantities if not one.name.endswith((".mean", ".max")))
+    ends = {f"{name}.velocity": f"{name}.position.final" for name in names}
+    return replace(bed, quantities=kept, budget=240, edges=(), own=tuple(ends.items()), local=True)
+
+
+def acted(bed: Testbed, do: Mapping[str, Any]) -> tuple[Edge, ...]:
+    """Return which settable states acted on which outcomes in one run.
+
+    They did if edges of the local graphs of its control steps lead from one to the other, in the
+    order of time. An edge by contact is there in steps in which a chain of contacts joins its ends.
+    """
+    live = bed.world.live(bed.setting["policy"], do=do)
+    reached = {cause: {cause} for cause, _ in bed.own}
+    for _ in range(bed.setting["steps"]):
+        graph = live.world.local_graph(live.world.task.idle(live.world))
+        reached = {
+            cause: {effect for one in some for effect in graph.successors(one)}
+            for cause, some in reached.items()
+        }
+        live.step()
+    live.close()
+    return tuple(
+        (cause, one.name)
+        for cause, some in reached.items()
+        for one in bed.outcomes
+        if one.reads and one.reads.name in some and (cause, one.name) not in bed.own
     )
 
 
@@ -509,6 +605,7 @@ WORLDS: Mapping[str, tuple[Callable[[np.random.Generator, Knobs], Testbed], str]
     "equations": (equations, "A random acyclic model of equations."),
     "servo": (servos, "Arms whose servos follow one another."),
     "network": (network, "Masses on a random network of springs, for one step."),
+    "row": (row, "Boxes on a rail, which act on one another only while they touch."),
     **{name: (partial(rig, made), made.doc) for name, made in RIGS.items()},
 }
 

@@ -119,6 +119,18 @@ def test_explanations_set_all_variables_at_the_same_distance() -> None:
         assert far[0] >= 0.2
 
 
+def test_answers_that_are_names_are_drawn_before_the_rest() -> None:
+    """All draws of a seed have one, at all levels, and another key another one."""
+    causes = [*RIGS["funnel"].causes]
+    for kind in ("explanation", "diagnosis"):
+        one, other = drawn(kind, "funnel", 2)
+        lot = one.view.lot
+        assert one.answer == other.answer == causes[int(6 * lot)]
+        assert one.query["run"] != other.query["run"]
+        shown = lab.Question.of({**one.spec, "level": "L4"})
+        assert shown.view.quantities[shown.answer].name == one.answer
+
+
 def test_edges_of_equations_are_those_of_their_weights() -> None:
     """Pairs with a hidden common cause are those on which one acts."""
     (asked,) = drawn("graph", "equations", 1)
@@ -139,6 +151,7 @@ def simulated(asked: lab.Question, values: Mapping[str, float]) -> dict[str, flo
     for name in ("left", "right"):
         model.body(name).mass = values[f"{name}.mass"]
         data.joint(name).qvel = values[f"{name}.velocity"]
+    data.joint("left").qpos = values["left.position"]
     model.tendon_stiffness[0] = values["spring.stiffness"]
     mujoco.mj_setConst(model, mujoco.MjData(model))
     path = []

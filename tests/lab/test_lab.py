@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import subprocess
 import sys
+import zlib
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 
 from scm_world import lab
 from scm_world.errors import ScmWorldError
-from scm_world.lab.agents import _confounded
+from scm_world.lab import worlds
+from scm_world.lab.agents import DESIGNS, ROUNDS, _confounded, _Known, _Seen
 from scm_world.lab.expressions import evaluate
-from scm_world.lab.questions import build
+from scm_world.lab.questions import LevelView, build
 
 
 def test_a_question_is_answered_by_the_solver_and_by_no_trivial_answer() -> None:
@@ -71,6 +75,7 @@ HOSTILE: tuple[tuple[str, Any], ...] = (
     ("submit", {"answer": "1", "confidence": float("nan")}),
     ("submit", {"answer": 1.0, "confidence": 0.5}),
     ("submit", {"answer": ["1"] * 10**5, "confidence": 0.5}),
+    ("look", {"episode": 0}),
     ("note", {"text": "x" * 10**6}),
     ("note", {"text": 3}),
     ("__init__", {"question": None}),
@@ -167,24 +172,62 @@ class Tools:
         return getattr(self._room, name)
 
 
-@pytest.mark.parametrize("kind", ["control", "prediction"])
-def test_the_random_agent_needs_the_tools_only(kind: str) -> None:
-    """Through other hands it does the same."""
+@pytest.mark.parametrize(
+    ("agent", "kind"),
+    [*zip(DESIGNS, ("graph", "control", "law", "graph", "prediction"), strict=True)],
+)
+def test_agents_need_the_tools_only(agent: str, kind: str) -> None:
+    """Through other hands each does the same; it spends the budget."""
     asked = build(kind, "equations", 1, "L2", lab.Knobs(), 0, None)
     room = lab.Laboratory(asked)
-    lab.AGENTS["random"](Tools(room))  # type: ignore[arg-type]
-    assert room.record() == lab.play("random", asked).record()
-    other = lab.play("random", build(kind, "equations", 2, "L2", lab.Knobs(), 0, None))
-    assert other.calls[1] != room.calls[1]
+    lab.AGENTS[agent](Tools(room))  # type: ignore[arg-type]
+    assert room.record() == lab.play(agent, asked).record()
+    assert room.remaining == 0
+
+
+def test_the_information_that_a_question_asks_for_is_about_its_cause() -> None:
+    """Greedy information sets the cause much more often than chance, and then in one experiment."""
+    asked = build("effect", "equations", 3, "L2", lab.Knobs(), 0, None)
+    shares = {}
+    for agent in ("random", "information"):
+        sets = [one["arguments"].get("do", {}) for one in lab.play(agent, asked).calls]
+        shares[agent] = sum(asked.query["cause"] in do for do in sets) / ROUNDS
+    assert shares["information"] > 0.8 > 0.4 > shares["random"]
+
+
+@pytest.mark.parametrize("names", [("a",), ("b",), ("a", "b")])
+def test_estimates_are_those_of_the_equations(names: tuple[str, ...]) -> None:
+    """Of b = 2a + noise and y = 3b - a + noise, from rows in which one, or both, were set."""
+    rng = np.random.default_rng(0)
+    variables = [{"name": n, "readable": True, "settable": [-1.0, 1.0]} for n in "aby"]
+    about = {"kind": "effect", "query": None, "remaining": 0, "variables": variables}
+    about["settable_variables_act_on_one_another"] = True
+
+    def experiment(do: dict[str, Any], n: int) -> dict[str, Any]:
+        found = {}
+        for name, mean in (("a", lambda f: 0.0), ("b", lambda f: 2 * f["a"]),
+                           ("y", lambda f: 3 * f["b"] - f["a"])):  # fmt: skip
+            noise = 0.3 * rng.normal(size=n)
+            found[name] = rng.uniform(*do[name], n) if name in do else mean(found) + noise
+        return {"columns": found}
+
+    room: Any = SimpleNamespace(describe=lambda: about, observe=lambda n: experiment({}, n))
+    room.experiment = experiment
+    seen = _Seen(_Known(room), rng)
+    for do in ({}, *({name: [-1.0, 1.0]} for name in names), {n: [-1.0, 1.0] for n in names}):
+        seen.experiment(do, 200)
+    slopes = {"a": 5.0, "b": 3.0}
+    for name in names:
+        ends = seen.predict("y", [{name: 1.0}, {name: -1.0}])
+        assert ends[0] - ends[1] == pytest.approx(2.0 * slopes[name], abs=0.6)
 
 
 def test_equal_residuals_share_a_cause() -> None:
     """A correlation of one is no division by zero."""
     same = np.random.default_rng(0).normal(size=40)
     table = {"a": same, "b": -same, "c": np.random.default_rng(1).normal(size=40)}
-    room = SimpleNamespace(observe=lambda n: {"columns": table}, remaining=40)
     with np.errstate(all="raise"):
-        found = _confounded(SimpleNamespace(room=room), [], dict.fromkeys(table, table))  # type: ignore[arg-type]
+        found = _confounded(table)
     assert found == [["a", "b"]]
 
 
@@ -221,5 +264,106 @@ def test_the_command_runs_replays_and_plays(tmp_path: Path) -> None:
     assert played.exit_code == 0, played.output
     assert "not JSON" in played.output
     assert '"brier"' in played.output
+    (secret := tmp_path / "key.txt").write_text("a secret of a test\n")
+    asked = ["lab", "run", "--seed", "3", "--out", path]
+    private = run.invoke(app, [*asked, "--key", str(secret)])
+    assert private.exit_code == 0, private.output
+    in_room = {"SCM_LAB_KEY": "a secret of a test"}
+    assert "identical" in run.invoke(app, ["lab", "replay", path], env=in_room).output
+    assert run.invoke(app, ["lab", "replay", path]).exit_code == 1
     assert "counterfactual" in run.invoke(app, ["lab", "list"]).output
     assert run.invoke(app, ["lab", "replay"]).exit_code == 2
+
+
+def test_a_strike_moves_the_block_as_in_plain_mujoco() -> None:
+    """The mean under an intervention is what the engine gives for these numbers."""
+    rng, names = np.random.default_rng(3), [*worlds.RIGS["pushing"].causes]
+    view = LevelView(worlds.testbed("pushing", rng, lab.Knobs()), "L2", lab.Knobs(), 3)
+    do = {name: 0.3 * view.ends(name)[0] + 0.7 * view.ends(name)[1] for name in names}
+    xml = worlds.RIGS["pushing"].xml("plain", np.random.default_rng(3).uniform(0.7, 1.4, 3))
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    for body in ("pusher", "block"):
+        model.body(body).mass = do[f"{body}.mass"]
+    model.geom("block").friction[0] = do["block.friction"]
+    model.joint("pusher").damping[0] = do["pusher.damping"]
+    data.joint("offset").qpos, data.joint("pusher").qvel = (
+        do["offset.position"],
+        do["pusher.velocity"],
+    )
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    mujoco.mj_step(model, data, nstep=240)
+    found = view.means({**do, "lamp0.brightness": 0.5})
+    assert data.joint("block_x").qpos > 0.03
+    for joint in ("block_x", "block_turn"):
+        assert found[f"{joint}.position.final"] == pytest.approx(
+            float(data.joint(joint).qpos[0]), abs=1e-9
+        )
+
+
+def test_an_episode_that_was_run_is_looked_at_and_it_is_the_same_episode() -> None:
+    """Its readings are repeated, the red box goes to the right, and masked levels are refused."""
+    asked = build("effect", "boxes", 1, "L2", lab.Knobs(noise=0.0, selection=True), 0, None)
+    room = lab.Laboratory(asked)
+    refused = room.call("look", {"episode": 0})
+    assert "before any was run" in refused["refused"]
+    rows = len(room.observe(6)["columns"]["first.position.final"])
+    far = room.experiment({"first.velocity": 2.4}, n=2)["columns"]
+    assert rows < 6  # those that are not shown have no number
+    assert "refused" in room.call("look", {"episode": rows + 2})
+    assert "refused" in room.call("look", {"episode": 0, "frames": 9})
+    again = asked.view.fresh().episode({"first.velocity": 2.4}, 0, 7)
+    for name in ("first", "second"):
+        assert again.final(f"{name}.position") == far[f"{name}.position.final"][1]
+    seen = room.look(rows + 1)
+    assert room.spent == 8
+    assert seen["steps"] == [0, 2, 4]
+    places = []
+    for one in seen["pictures"]:
+        data = base64.b64decode(one)
+        assert data[:8] == b"\x89PNG\r\n\x1a\n"
+        pixels = np.frombuffer(zlib.decompress(data[41:-16]), np.uint8).reshape(240, -1)[:, 1:]
+        red = pixels.reshape(240, 320, 3).astype(int)
+        places.append(np.nonzero(red[..., 0] > red[..., 2] + 50)[1].mean())
+    assert places[0] < places[1] < places[2]
+    masked = lab.Laboratory(build("effect", "boxes", 1, "L3", lab.Knobs(), 0, None))
+    masked.observe()
+    assert "level L3" in masked.call("look", {"episode": 0})["refused"]
+
+
+def test_speeds_act_on_other_boxes_where_plain_mujoco_says_so_and_only_by_contact(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Finite differences of the engine around the run have the same edges; without contact none."""
+    files, real = list[str](), worlds._model
+    monkeypatch.setattr(worlds, "_model", lambda *of: files.append(real(*of)) or files[-1])
+    asked = build("graph", "row", 6, "L2", lab.Knobs(), 1, None)
+    given = {name: value for name, value in asked.query["set"].items() if "box" in name}
+
+    def final(speeds: dict[str, float], *, contact: bool) -> dict[str, float]:
+        model = mujoco.MjModel.from_xml_string(files[-1])
+        if not contact:
+            model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+        data = mujoco.MjData(model)
+        for name, value in speeds.items():
+            data.joint(name.partition(".")[0]).qvel = value
+        mujoco.mj_step(model, data, nstep=240)
+        return {name: float(data.joint(name.partition(".")[0]).qpos[0]) for name in speeds}
+
+    def edges(*, contact: bool) -> list[list[str]]:
+        found = []
+        for cause, value in given.items():
+            low, high = (
+                final({**given, cause: value + apart}, contact=contact) for apart in (-0.02, 0.02)
+            )
+            found += [
+                [cause, name.replace("velocity", "position.final")]
+                for name in given
+                if name != cause and abs(high[name] - low[name]) > 1e-9
+            ]
+        return sorted(found)
+
+    assert len(asked.answer["edges"]) == 5  # one pair in one direction only
+    assert edges(contact=True) == asked.answer["edges"]
+    assert edges(contact=False) == []
+    assert asked.grade({"edges": asked.answer["edges"]}) == 1.0

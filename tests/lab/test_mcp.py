@@ -160,6 +160,22 @@ def test_many_clients_at_once_spend_each_episode_once() -> None:
         assert sorted(found[offset::2]) == expected
 
 
+def test_pictures_are_images() -> None:
+    """They are content of their own; everything else is text, and structured."""
+
+    class Rooms:
+        tools = staticmethod(lab.tools)
+
+        def call(self, tool: str, arguments: Any) -> dict[str, Any]:
+            return {"steps": [0, 4], "pictures": ["AAAA", "AAAB"]}
+
+    with served(Rooms()) as post:  # type: ignore[arg-type]
+        text = post(request("tools/call", name="look", arguments={}))[1]
+    assert result_of(text) == {"steps": [0, 4]}
+    images = json.loads(text)["result"]["content"][1:]
+    assert [(one["type"], one["data"]) for one in images] == [("image", "AAAA"), ("image", "AAAB")]
+
+
 def test_an_address_that_others_reach_needs_a_token() -> None:
     """Without it nothing is served; without a token, only requests of this machine are."""
     rooms = Laboratories(ASKED)
