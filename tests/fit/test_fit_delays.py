@@ -148,18 +148,18 @@ def test_sensors_are_fitted_by_name() -> None:
 
 def test_commands_before_the_first_row_are_assumed_and_that_is_said() -> None:
     """Another command acted there: with its measurements left empty, the model is right again."""
-    text = """<mujoco><option timestep="0.002"/><worldbody><body name="pole">
+    text = """<mujoco><option timestep="0.005"/><worldbody><body name="pole">
     <joint name="hinge" axis="0 1 0" damping="0.01"/>
     <geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="0.2"/></body></worldbody>
     <actuator><motor name="motor" joint="hinge"/></actuator></mujoco>"""
     rng, model = np.random.default_rng(0), mujoco.MjModel.from_xml_string(text)
-    data, seen, sent = mujoco.MjData(model), list[float](), rng.uniform(-1.0, 1.0, 100)
-    for step in range(100):
+    data, seen, sent = mujoco.MjData(model), list[float](), rng.uniform(-1.0, 1.0, 60)
+    for step in range(60):
         seen.append(float(data.qpos[0]) + 1e-3 * rng.normal())
         data.ctrl[0] = sent[step - 8] if step >= 8 else -0.5
-        mujoco.mj_step(model, data, 10)
+        mujoco.mj_step(model, data, 4)
     world, position = sw.World(text), np.array(seen)
-    recording = {"time": 0.02 * np.arange(100), "motor.control": sent, "hinge.position": position}
+    recording = {"time": 0.02 * np.arange(60), "motor.control": sent, "hinge.position": position}
     wrong = world.fit(recording, ["delay", "hinge.damping"])
     late = wrong.values["delay"]
     assert f"if another one acted in the first {late:.3g} s of a run" in str(wrong)
