@@ -188,3 +188,18 @@ def test_a_file_has_the_whole_inertia(tmp_path: Path) -> None:
         body = mujoco.MjModel.from_xml_path(str(tmp_path / "arm.xml")).body("load")
         read = ten_numbers(body.mass[0], body.ipos, body.inertia, np.roll(body.iquat, -1))
         np.testing.assert_allclose(read, [*fit.values.values()], rtol=1e-9, atol=1e-15)
+
+
+def test_draws_of_the_posterior_are_bodies_with_its_spread() -> None:
+    """Ten numbers of worlds that are drawn have the means and the errors of the table."""
+    world = sw.World(THREE, expose=EXPOSE)
+    fit = world.fit(recorded(world, HELD, 40), "load.inertial", noise=1e-3)
+    worlds = sw.World(THREE, expose=EXPOSE, num_worlds=200)
+    worlds.reset(seed=0, do=fit.posterior())
+    values = worlds.values()
+    parts = [np.asarray(values[f"load.{part}"]) for part in PARTS]
+    drawn = np.array([ten_numbers(*one) for one in zip(*parts, strict=True)])
+    assert (2.0 * parts[2].max(axis=1) <= parts[2].sum(axis=1)).all()
+    away = (drawn - [*fit.values.values()]) / (fit.units * fit.errors)
+    np.testing.assert_allclose(away.mean(axis=0), 0.0, atol=4 / 200**0.5)
+    np.testing.assert_allclose(away.std(axis=0), 1.0, atol=4 / 400**0.5)
