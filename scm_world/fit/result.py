@@ -368,9 +368,10 @@ class Fit:
         A row has ``parameter``, ``value``, ``low`` and ``high`` of the 95 % interval, ``default``,
         ``deviation`` (value : default - 1; NaN if the default is zero), ``unit``, and whether the
         parameter is ``determined``: the width of its interval is at most its value or its scale
-        (that of a positive parameter, a factor of e), or the interval begins at the end of the
-        range and is below the default: at most this. ``low`` and ``high`` are NaN where there is no
-        interval: where it would be the whole range.
+        (that of a positive parameter, a factor of e; that of an inertial one, see
+        ``Inertial.units``), or the interval begins at the end of the range and is below the
+        default: at most this. ``low`` and ``high`` are NaN where there is no interval: where it
+        would be the whole range.
         """
         import pandas as pd
 

@@ -396,7 +396,7 @@ def _inertials(
     named = {name: own for name, own in every.items() if fits(name, (pattern,))}
     found = {name: own for name, own in named.items() if {*own} <= {*known}}
     for name, own in named.items() if not found else ():
-        why = (f"{n}, which {refused.get(n, 'does not exist')}" for n in own if n not in known)
+        why = (f"{n}, which {refused.get(n, 'cannot be set')}" for n in own if n not in known)
         raise NotIntervenable(name, f"is not known without {', and without '.join(why)}")
     return found
 
