@@ -85,16 +85,35 @@ def run(asked: QuestionOptions, *, agent: str = "random", out: options.Text = No
     _finish(lab.play(agent, asked.question()), out)
 
 
-def play(asked: QuestionOptions, *, out: options.Text = None) -> None:
-    """Answer a question by hand: type a tool and its arguments as JSON.
+def play(
+    asked: QuestionOptions,
+    *,
+    out: options.Text = None,
+    page: bool = False,
+    port: Annotated[int, typer.Option(min=0, max=65535)] = 8730,
+    open_: bool = False,
+) -> None:
+    """Answer a question by hand: type a tool and its arguments as JSON, or use a page.
 
-    Example: scm-world lab play --kind effect --world springs
+    Example: scm-world lab play --kind effect --world springs --page --open
 
     Args:
         out: File of the run, for scm-world lab replay.
+        page: Serve a page with a form for each tool, until Ctrl-C.
+        port: Port of the page; 0 for any that is free.
+        open_: Open the page in the usual browser.
     """
     from scm_world import lab
 
+    if page:
+        for package in ("starlette", "uvicorn"):
+            load(package, package, "studio")
+        from scm_world.studio.lab import serve as served
+
+        room = lab.Laboratory(asked.question())
+        served(room, port=port, open_=open_, say=console.say)
+        _finish(room, out)
+        return
     room = lab.Laboratory(asked.question())
     typer.echo(json.dumps(room.call("describe"), indent=1, ensure_ascii=False))
     typer.echo('Type for example: experiment {"do": {"x0": 1}, "n": 5}')

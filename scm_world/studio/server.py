@@ -15,7 +15,7 @@ import threading
 import webbrowser
 from base64 import b64encode
 from collections import deque
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Mapping
 from functools import cache
 from pathlib import Path
 from queue import SimpleQueue
@@ -56,6 +56,44 @@ MODULES = {
 def read(name: str) -> str:
     """Return a file of the page."""
     return (PAGE / name).read_text(encoding="utf-8")
+
+
+def page(name: str, parts: Mapping[str, str]) -> Response:
+    """Return a page with its parts, whose own scripts alone may run."""
+    text = re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], read(name))
+    scripts = re.findall(r"<script[^>]*>(.*?)</script>", text, flags=re.DOTALL)
+    hashes = (b64encode(hashlib.sha256(s.encode()).digest()).decode() for s in scripts if s)
+    sources = " ".join(f"'sha256-{one}'" for one in hashes)
+    headers = {
+        "Content-Security-Policy": (
+            f"default-src 'none'; script-src 'self' {sources}; style-src 'unsafe-inline'; "
+            "img-src 'self' data: blob:; media-src blob:; connect-src 'self' ws: wss:; "
+            "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+        ),
+        "Referrer-Policy": "no-referrer",
+        "X-Content-Type-Options": "nosniff",
+        "Cache-Control": "no-store",
+    }
+    return Response(text, media_type="text/html", headers=headers)
+
+
+def allowed(request: Request | WebSocket, host: str, needed: str = "") -> bool:
+    """Return whether a request comes from our page: no other page may reach this one.
+
+    Args:
+        request: The request.
+        host: Address that is bound.
+        needed: Token of the address; none if empty.
+    """
+    token = request.query_params.get("token", "")
+    if needed and not hmac.compare_digest(token.encode(), needed.encode()):
+        return False
+    given = request.headers.get("host", "")
+    name = re.sub(r":\d+$", "", given).strip("[]")
+    if host in LOCAL and name not in LOCAL:
+        return False  # the name of another site that leads here
+    origin = request.headers.get("origin")
+    return origin is None or origin.partition("://")[2] == given
 
 
 @final
@@ -173,15 +211,7 @@ class Studio:
         self._sessions: dict[str, _Session] = {}
         imports = {name: f"./{file}" for name, file in MODULES.items()}
         parts = {"imports": json.dumps({"imports": imports}), "style": read("studio.css")}
-        self._page = re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], read("index.html"))
-        scripts = re.findall(r"<script[^>]*>(.*?)</script>", self._page, flags=re.DOTALL)
-        hashes = (b64encode(hashlib.sha256(s.encode()).digest()).decode() for s in scripts if s)
-        sources = " ".join(f"'sha256-{one}'" for one in hashes)
-        self._policy = (
-            f"default-src 'none'; script-src 'self' {sources}; style-src 'unsafe-inline'; "
-            "img-src 'self' data: blob:; media-src blob:; connect-src 'self' ws: wss:; "
-            "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-        )
+        self._page = page("index.html", parts)
         routes = [
             Route("/", self._index),
             Route("/{file:path}", self._file),
@@ -207,28 +237,10 @@ class Studio:
                     del self._sessions[name]
                     await asyncio.to_thread(one.worker.close)
 
-    def _allowed(self, request: Request | WebSocket) -> bool:
-        """Return whether a request comes from our page: no other page may reach this one."""
-        token = request.query_params.get("token", "")
-        if self.token and not hmac.compare_digest(token.encode(), self.token.encode()):
-            return False
-        host = request.headers.get("host", "")
-        name = re.sub(r":\d+$", "", host).strip("[]")
-        if self.host in LOCAL and name not in LOCAL:
-            return False  # the name of another site that leads here
-        origin = request.headers.get("origin")
-        return origin is None or origin.partition("://")[2] == host
-
     async def _index(self, request: Request) -> Response:
-        if not self._allowed(request):
+        if not allowed(request, self.host, self.token):
             return PlainTextResponse("open the address that the command printed", 403)
-        headers = {
-            "Content-Security-Policy": self._policy,
-            "Referrer-Policy": "no-referrer",
-            "X-Content-Type-Options": "nosniff",
-            "Cache-Control": "no-store",
-        }
-        return Response(self._page, media_type="text/html", headers=headers)
+        return self._page
 
     async def _file(self, request: Request) -> Response:
         name = request.path_params["file"]
@@ -239,7 +251,7 @@ class Studio:
 
     async def _socket(self, socket: WebSocket) -> None:
         name = socket.path_params["name"]
-        if not self._allowed(socket) or not re.fullmatch(r"[0-9a-f]{32}", name):
+        if not allowed(socket, self.host, self.token) or not re.fullmatch(r"[0-9a-f]{32}", name):
             await socket.close(4003, "not allowed")
             return
         await socket.accept()
