@@ -342,7 +342,7 @@ def whole(folder: Path, n: int) -> dict[str, Any]:
     for kind, known in found.items():
         known["trivial"] = {n: round(float(np.mean(s)), 3) for n, s in known["trivial"].items()}
         if kind in answers:
-            known |= named(answers[kind])
+            known.update(named(answers[kind]))
     for i in np.random.default_rng(0).permutation(len(rows))[:n]:
         question = Question.of(rows[i])
         said = confirm(question)
