@@ -4,6 +4,7 @@
 
     python -m benchmarks.lab questions --n 25  # of each kind: certificates and CPU time
     python -m benchmarks.lab truth             # their answers, by an independent script
+    python -m benchmarks.lab whole --made DIR --n 200  # figures of a made lab-1; as truth does
     python -m benchmarks.lab names --n 40      # guesses by names, of seeds of each world
     python -m benchmarks.lab suites --made DIR # the manifests, with the hashes of made folders
     python -m benchmarks.lab curves            # scores of agents by budget; ten minutes, resumable
@@ -25,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas
 
 from benchmarks import as_json, figures
 from benchmarks.lab_truth import confirm
@@ -317,6 +319,40 @@ def trained(steps: int) -> dict[str, Any]:
     return {"steps": steps, "CPU seconds": round(time.process_time() - begin), **rows}
 
 
+def whole(folder: Path, n: int) -> dict[str, Any]:
+    """Return figures of a made ``lab-1``, and confirm ``n`` of its public questions at random."""
+    found, rows = defaultdict[str, dict[str, Any]](dict), list[dict[str, Any]]()
+    answers = defaultdict[str, list[tuple[str, str]]](list)
+    for path in sorted(folder.glob("questions-*.parquet")):
+        part = path.stem.removeprefix("questions-")
+        about, kind = json.loads((folder / f"{part}.json").read_text())["content"], part[:-3]
+        known = found[kind]
+        for what, value in (
+            ("questions", about["rows"]),
+            ("rejected draws", sum(about["draws"])),
+            ("seeds without one", about["skipped"]),
+        ):
+            known[what] = known.get(what, 0) + value
+        for name, score in about["trivial"].items():
+            known.setdefault("trivial", defaultdict(list))[name].append(score)
+        for row in pandas.read_parquet(path).to_dict("records"):
+            rows.append(json.loads(row["spec"]))
+            if kind in ("explanation", "diagnosis") and row["level"] in ("L1", "L2"):
+                answers[kind].append((row["world"], json.loads(row["answer"])))
+    for kind, known in found.items():
+        known["trivial"] = {n: round(float(np.mean(s)), 3) for n, s in known["trivial"].items()}
+        if kind in answers:
+            known.update(named(answers[kind]))
+    for i in np.random.default_rng(0).permutation(len(rows))[:n]:
+        question = Question.of(rows[i])
+        said = confirm(question)
+        count = found[question.kind].setdefault("confirmed", {})
+        count[str(said["confirmed"])] = count.get(str(said["confirmed"]), 0) + 1
+        if not said["confirmed"]:
+            found[question.kind].setdefault("not confirmed", []).append([rows[i], said])
+    return dict(found)
+
+
 # --- manifests ------------------------------------------------------------------------------------
 
 
@@ -380,6 +416,8 @@ ABOUT = {
 def manifests(made: dict[str, Path]) -> None:
     """Write the manifests, with hashes, draws and trivial scores of parts that were made."""
     for name, parts in (("physics-1", tables()), ("lab-1", recipes())):
+        if made and name not in made:
+            continue
         found = {"versions": suites._here()}
         for part, recipe in parts.items():
             path = made[name] / f"{part}.json" if name in made else None
@@ -393,7 +431,7 @@ def manifests(made: dict[str, Path]) -> None:
         (MANIFESTS / f"{name}.json").write_text(text + "\n")
 
 
-PARTS = ("questions", "truth", "names", "suites", "curves", "trained")
+PARTS = ("questions", "truth", "whole", "names", "suites", "curves", "trained")
 
 
 def main() -> None:
@@ -416,6 +454,8 @@ def main() -> None:
         figures.main(["lab"])
     if given.part == "questions":
         questions(given.n, given.workers, given.rows)
+    if given.part == "whole":
+        RESULTS.write_text(as_json({**known, "lab-1": whole(given.made[0], given.n)}) + "\n")
     if given.part == "truth":
         rows = [json.loads(line) for line in given.rows.read_text().splitlines()]
         found = table(rows)
