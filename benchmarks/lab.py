@@ -170,18 +170,17 @@ def table(rows: list[dict[str, Any]]) -> dict[str, Any]:
 def named(rows: list[tuple[str, str]]) -> dict[str, Any]:
     """Return how often the most frequent name of each world is right.
 
-    It is chosen on every other row and counted on the others, and the other way round, so that
-    chance does not raise it. The interval is that of Wilson.
+    For each row it is that of the other rows, so that chance does not raise it; names that are
+    equally frequent share. The interval has 95 %.
     """
     right, counts = list[float](), defaultdict[str, Counter[str]](Counter)
-    for half in (0, 1):
-        often = defaultdict[str, Counter[str]](Counter)
-        for world, name in rows[half::2]:
-            often[world][name] += 1
-        right += [name == often[world].most_common(1)[0][0] for world, name in rows[1 - half :: 2]]
     for world, name in rows:
         counts[world][name] += 1
-    share = mean_interval(np.array(right, float), proportion=True)
+    for world, name in rows:
+        others = counts[world] - Counter([name])
+        first = [n for n, often in others.items() if often == max(others.values())]
+        right.append(first.count(name) / max(len(first), 1))
+    share = mean_interval(np.array(right), proportion=True)
     return {
         "questions": len(rows),
         "most frequent name": [round(x, 3) for x in (share.value, share.low, share.high)],
