@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from itertools import permutations
 from typing import final
 
@@ -11,7 +12,12 @@ import numpy as np
 
 from scm_world._types import ArrayLike, Floats
 from scm_world.errors import NotIntervenable
-from scm_world.geometry.rotations import quaternion_product, rotation_matrix
+from scm_world.geometry.rotations import (
+    from_rotation_vector,
+    quaternion_product,
+    rotation_matrix,
+    to_rotation_vector,
+)
 
 INERTIAL = ".inertial"  # after the name of a body: its mass, center of mass and inertia
 AXES = "principal_axes"
@@ -32,7 +38,7 @@ def second_moments(mass: float, center: Floats, moments: Floats, axes: Floats) -
         moments: Its principal moments of inertia [kg m²], shape (3,).
         axes: Orientation of its principal axes in its frame, (x, y, z, w).
     """
-    turn, along = rotation_matrix(axes), 0.5 * moments.sum() - moments
+    turn, along = rotation_matrix(axes), swapped(moments, 0.5)
     return np.asarray((turn * along) @ turn.T + mass * np.outer(center, center))
 
 
@@ -41,6 +47,24 @@ def ten_numbers(mass: float, center: Floats, moments: Floats, axes: Floats) -> F
     spread = second_moments(mass, center, moments, axes)
     tensor = np.trace(spread) * np.eye(3) - spread
     return np.concatenate([[mass], mass * center, tensor[UPPER]])
+
+
+def swapped(moments: Floats, share: float = 1.0) -> Floats:
+    """Return a share of the sum, less each: moments of second moments, or these, with 0.5, back."""
+    return np.asarray(share * moments.sum(axis=-1, keepdims=True) - moments)
+
+
+SECOND = partial(swapped, share=0.5)
+
+
+def turned_by(axes: Floats, vector: Floats) -> Floats:
+    """Return axes that are turned by a rotation vector in their own frame, (..., 4)."""
+    return quaternion_product(axes, from_rotation_vector(vector))
+
+
+def turn_from(axes: Floats, other: Floats) -> Floats:
+    """Return the rotation vector from axes to others, (..., 3); see ``turned_by``."""
+    return to_rotation_vector(quaternion_product(axes * [-1.0, -1.0, -1.0, 1.0], other))
 
 
 def _factor(matrix: Floats) -> Floats:
@@ -114,7 +138,7 @@ class Inertial:
         along, turn = mass * np.maximum(along[[*order]], 0.0), turn[:, order]
         turn = turn * np.where(np.diag(turn) < 0.0, -1.0, 1.0)
         turn[:, np.abs(np.diag(turn)).argmin()] *= np.sign(np.linalg.det(turn))
-        moments = np.roll(along, -1) + np.roll(along, -2)
+        moments = np.roll(along, -1) + np.roll(along, -2)  # whose rounding obeys the triangle
         axes = quaternion_product(axes, Rotation.from_matrix(turn).as_quat())
         return mass, center + self.length * scaled[1:4], moments, axes / np.linalg.norm(axes)
 

@@ -51,6 +51,7 @@ from scm_world.fit.targets import (
     Target,
     blocks_of,
     delays_of,
+    drawn_of,
     free_states,
     numbers_of,
     posterior_of,
@@ -298,7 +299,7 @@ class Fit:
 
         Their differences have errors, which noise does not hide where it is little.
         """
-        least = max(np.sqrt(self.discount) / PRIOR, ROUNDING * sizes.max())
+        least = max(np.sqrt(self.discount) / PRIOR, ROUNDING * sizes.max(initial=0.0))
         return np.asarray((sizes < least) & bool(blocks_of(self.targets)))
 
     @cached_property
@@ -367,9 +368,10 @@ class Fit:
         A row has ``parameter``, ``value``, ``low`` and ``high`` of the 95 % interval, ``default``,
         ``deviation`` (value : default - 1; NaN if the default is zero), ``unit``, and whether the
         parameter is ``determined``: the width of its interval is at most its value or its scale
-        (that of a positive parameter, a factor of e), or the interval begins at the end of the
-        range and is below the default: at most this. ``low`` and ``high`` are NaN where there is no
-        interval: where it would be the whole range.
+        (that of a positive parameter, a factor of e; that of an inertial one, see
+        ``Inertial.units``), or the interval begins at the end of the range and is below the
+        default: at most this. ``low`` and ``high`` are NaN where there is no interval: where it
+        would be the whole range.
         """
         import pandas as pd
 
@@ -615,16 +617,12 @@ class Fit:
 
         They are drawn together, from the normal distribution of the scaled parameters that
         ``counterfactual`` uses, within their ranges: ``start=fit.posterior()`` of an environment
-        randomises by what was not determined. A delay is not among them.
-
-        Raises:
-            ModelError: A whole inertia was fitted: its four variables have no normal distribution.
+        randomises by what was not determined. A delay is not among them. Of an inertia the
+        logarithms of the mass and of second moments, the center, and a turn of the axes are drawn.
         """
-        if blocks := blocks_of(self.targets):
-            names = ", ".join(block.name for block, _ in blocks)
-            problem = f"{names} has four variables, which have no normal distribution together"
-            raise ModelError([f"{problem}: fit single parameters, such as the mass, to draw them"])
-        return posterior_of(self.targets, self.scaled, self.spread)
+        targets, scaled, into = drawn_of(self.targets, self.scaled)
+        along = self.sensitivities @ into / np.sqrt(self.discount)
+        return posterior_of(targets, scaled, spread_of(along))
 
     @typed
     def diagnose(

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain
 from typing import final
 
@@ -14,7 +15,18 @@ import numpy as np
 from scm_world._patterns import as_names, fits, fitting
 from scm_world._types import ArrayLike, Floats, Integers
 from scm_world.errors import NotIntervenable, UnknownOption, UnknownVariable
-from scm_world.fit.inertia import INERTIAL, LOGS, NUMBERS, PARTS, Inertial
+from scm_world.fit.inertia import (
+    INERTIAL,
+    LOGS,
+    NUMBERS,
+    PARTS,
+    SECOND,
+    Inertial,
+    swapped,
+    ten_numbers,
+    turn_from,
+    turned_by,
+)
 from scm_world.fit.recordings import MeasuredNumber, labels, settable_of
 from scm_world.queries.twins import twins_of
 from scm_world.queries.world import World
@@ -28,7 +40,10 @@ LATE = "_delay"  # after the name of an action: the delay of one command [contro
 TIMESTEP = "timestep"  # a setting of the engine, which no robot has
 LONGEST_DELAY = 20.0  # [control steps]
 UNSEEN = 0.1  # scale of a parameter that is zero, if nothing shows a better one
+LIGHTEST = 1e-8  # least mass [kg] and second moment [kg m²] of an inertia that is drawn
 FAR = 12.0  # largest logarithm of a positive parameter, relative to its default
+
+Form = Callable[[Floats], Floats]
 
 
 @final
@@ -51,6 +66,8 @@ class Target:
         values: All numbers of the variable in the world; None for a delay, which the world lacks.
         block: The inertia of which it is one of ten numbers, one after another. It is searched in
             the numbers of the block, and told in those of ``Inertial.numbers``.
+        forms: What turns values of the variable into those of which it is a component, and back,
+            where these can have any value.
     """
 
     name: str
@@ -65,6 +82,7 @@ class Target:
     whole: bool = False
     values: Floats | None = None
     block: Inertial | None = None
+    forms: tuple[Form, Form] = (np.asarray, np.asarray)
 
     @property
     def written(self) -> tuple[str, ...]:
@@ -114,7 +132,7 @@ class Conditional:
         values = np.broadcast_to(usual, (*lead, *usual.shape)).copy().reshape(*lead, -1)
         drawn = np.reshape(noise, (*lead, -1))[..., : len(self.own)] @ self.root.T + self.middle
         for i, (place, target) in enumerate(self.before):
-            there = np.reshape(parents[place], (*lead, -1))[..., target.component]
+            there = np.reshape(target.forms[0](parents[place]), (*lead, -1))[..., target.component]
             drawn = drawn + (target.scaled(there) - self.others[i])[..., None] * self.slope[:, i]
         for i, target in enumerate(self.own):
             value = target.value(np.clip(drawn[..., i], target.low, target.high))
@@ -122,7 +140,52 @@ class Conditional:
                 values = values * (value / values[..., target.component])[..., None]
             else:
                 values[..., target.component] = value
-        return np.asarray(values.reshape((*lead, *usual.shape)))
+        return np.asarray(self.own[0].forms[1](values.reshape((*lead, *usual.shape))))
+
+
+def _drawn(block: Inertial, at: Floats) -> tuple[list[Target], Floats]:
+    """Return numbers of an inertia whose normal distribution has only bodies that can exist.
+
+    They are the logarithms of the mass and of the second moments along the principal axes, the
+    center of mass, and the vector of a turn of these axes. Returned are also the derivatives of the
+    searched numbers by them, shape (10, 10).
+    """
+    mass, center, moments, axes = block.body(at)
+    turn = partial(turn_from, axes), partial(turned_by, axes)
+    means = np.asarray(mass), center, swapped(moments, 0.5), np.zeros(3)
+    plain: tuple[Form, Form] = np.asarray, np.asarray
+    forms: tuple[tuple[Form, Form], ...] = plain, plain, (SECOND, swapped), turn
+    found = list[Target]()
+    for name, mean, form in zip(block.values(at), means, forms, strict=True):
+        for i, value in enumerate(np.ravel(mean).tolist()):
+            log = name.endswith((".mass", ".inertia"))
+            scale = block.length if mean is center else 1.0
+            low, high = (math.log(LIGHTEST / value), FAR) if log else (-math.inf, math.inf)
+            about = name, name, i, "", value, scale, log, low, high, False, np.asarray(mean)
+            found.append(Target(*about, forms=form))
+
+    def searched(by: Floats) -> Floats:
+        values = np.array([float(t.value(n)) for t, n in zip(found, by, strict=True)])
+        body = values[0], values[1:4], swapped(values[4:7]), turned_by(axes, values[7:])
+        return np.asarray(block.searched(ten_numbers(*body)))
+
+    steps = 1e-5 * np.eye(10)
+    slopes = np.array([(searched(one) - searched(-one)) / 2e-5 for one in steps]).T
+    return found, slopes
+
+
+def drawn_of(
+    targets: Sequence[Target], scaled: Floats
+) -> tuple[tuple[Target, ...], Floats, Floats]:
+    """Return numbers that can be drawn, scaled, and derivatives of the given ones by them, (p, p).
+
+    They are the given ones, but for inertias.
+    """
+    found, numbers, into = [*targets], scaled.copy(), np.eye(len(scaled))
+    for block, own in blocks_of(targets):
+        found[own], into[own, own] = _drawn(block, scaled[own])
+        numbers[own] = 0.0
+    return tuple(found), numbers, into
 
 
 def posterior_of(targets: Sequence[Target], scaled: Floats, spread: Floats) -> dict[str, Mechanism]:
@@ -333,7 +396,7 @@ def _inertials(
     named = {name: own for name, own in every.items() if fits(name, (pattern,))}
     found = {name: own for name, own in named.items() if {*own} <= {*known}}
     for name, own in named.items() if not found else ():
-        why = (f"{n}, which {refused.get(n, 'does not exist')}" for n in own if n not in known)
+        why = (f"{n}, which {refused.get(n, 'cannot be set')}" for n in own if n not in known)
         raise NotIntervenable(name, f"is not known without {', and without '.join(why)}")
     return found
 

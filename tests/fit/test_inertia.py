@@ -80,9 +80,13 @@ def test_any_ten_numbers_are_a_body() -> None:
         np.testing.assert_array_equal(value, HELD[f"load.{part}"])
 
 
-@pytest.mark.parametrize("backend", ["mujoco", "bullet"])
-def test_turned_axes_step_as_a_file_with_that_inertia(backend: str) -> None:
+@pytest.mark.parametrize(
+    ("backend", "exact"), [("mujoco", 1e-12), ("bullet", 1e-12), ("warp:cpu", 1e-5)]
+)
+def test_turned_axes_step_as_a_file_with_that_inertia(backend: str, exact: float) -> None:
     """A ``do`` of the axes is what MuJoCo compiles from the full tensor, to rounding."""
+    if backend == "warp:cpu":
+        pytest.importorskip("mujoco_warp")
     full = "0.004 0.005 0.003 0.0005 -0.0004 0.0003"
     text = ARM.format(joint=THIRD, motor='<motor joint="c"/>', inertia=f'fullinertia="{full}"')
     model = mujoco.MjModel.from_xml_string(text)
@@ -99,7 +103,7 @@ def test_turned_axes_step_as_a_file_with_that_inertia(backend: str) -> None:
             world.advance(command)
             mujoco.mj_step(model, data, world.substeps)
         reached = [float(world[f"{joint}.position"]) for joint in "abc"]
-        np.testing.assert_allclose(reached, data.qpos, atol=1e-12)
+        np.testing.assert_allclose(reached, data.qpos, atol=exact)
 
 
 def test_a_load_is_found_and_every_trial_is_a_body(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -188,3 +192,18 @@ def test_a_file_has_the_whole_inertia(tmp_path: Path) -> None:
         body = mujoco.MjModel.from_xml_path(str(tmp_path / "arm.xml")).body("load")
         read = ten_numbers(body.mass[0], body.ipos, body.inertia, np.roll(body.iquat, -1))
         np.testing.assert_allclose(read, [*fit.values.values()], rtol=1e-9, atol=1e-15)
+
+
+def test_draws_of_the_posterior_are_bodies_with_its_spread() -> None:
+    """Ten numbers of worlds that are drawn have the means and the errors of the table."""
+    world = sw.World(THREE, expose=EXPOSE)
+    fit = world.fit(recorded(world, HELD, 40), "load.inertial", noise=1e-3)
+    worlds = sw.World(THREE, expose=EXPOSE, num_worlds=200)
+    worlds.reset(seed=0, do=fit.posterior())
+    values = worlds.values()
+    parts = [np.asarray(values[f"load.{part}"]) for part in PARTS]
+    drawn = np.array([ten_numbers(*one) for one in zip(*parts, strict=True)])
+    assert (2.0 * parts[2].max(axis=1) <= parts[2].sum(axis=1)).all()
+    away = (drawn - [*fit.values.values()]) / (fit.units * fit.errors)
+    np.testing.assert_allclose(away.mean(axis=0), 0.0, atol=4 / 200**0.5)
+    np.testing.assert_allclose(away.std(axis=0), 1.0, atol=4 / 400**0.5)
