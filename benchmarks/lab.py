@@ -4,6 +4,8 @@
 
     python -m benchmarks.lab questions --n 25  # of each kind: certificates and CPU time
     python -m benchmarks.lab truth             # their answers, by an independent script
+    python -m benchmarks.lab whole --made DIR --n 200  # figures of a made lab-1; as truth does
+    python -m benchmarks.lab answers --n 200   # of questions that need not be certified; as truth
     python -m benchmarks.lab names --n 40      # guesses by names, of seeds of each world
     python -m benchmarks.lab suites --made DIR # the manifests, with the hashes of made folders
     python -m benchmarks.lab curves            # scores of agents by budget; resumable
@@ -19,12 +21,15 @@ import json
 import runpy
 import time
 from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas
 
 from benchmarks import as_json, figures
 from benchmarks.lab_truth import confirm
@@ -165,18 +170,17 @@ def table(rows: list[dict[str, Any]]) -> dict[str, Any]:
 def named(rows: list[tuple[str, str]]) -> dict[str, Any]:
     """Return how often the most frequent name of each world is right.
 
-    It is chosen on every other row and counted on the others, and the other way round, so that
-    chance does not raise it. The interval is that of Wilson.
+    For each row it is that of the other rows, so that chance does not raise it; names that are
+    equally frequent share. The interval has 95 %.
     """
     right, counts = list[float](), defaultdict[str, Counter[str]](Counter)
-    for half in (0, 1):
-        often = defaultdict[str, Counter[str]](Counter)
-        for world, name in rows[half::2]:
-            often[world][name] += 1
-        right += [name == often[world].most_common(1)[0][0] for world, name in rows[1 - half :: 2]]
     for world, name in rows:
         counts[world][name] += 1
-    share = mean_interval(np.array(right, float), proportion=True)
+    for world, name in rows:
+        others = counts[world] - Counter([name])
+        first = [n for n, often in others.items() if often == max(others.values())]
+        right.append(first.count(name) / max(len(first), 1))
+    share = mean_interval(np.array(right), proportion=True)
     return {
         "questions": len(rows),
         "most frequent name": [round(x, 3) for x in (share.value, share.low, share.high)],
@@ -187,20 +191,13 @@ def named(rows: list[tuple[str, str]]) -> dict[str, Any]:
 def names(n: int) -> dict[str, Any]:
     """Score guesses by names: of ``n`` seeds of each world, which need not be certified."""
     found, typical = dict[str, Any](), list[list[float]]()
-
-    def first(kind: str, world: str, seed: int) -> Question:
-        for draw in range(40):
-            with suppress(Unusable):
-                return build(kind, world, seed, "L2", lab.Knobs(), draw, None)
-        raise Unusable([f"seed {seed}"])
-
     for kind in ("explanation", "diagnosis"):
         worlds = lab.offers(kind)
-        rows = [(world, first(kind, world, seed).answer) for seed in range(n) for world in worlds]
-        found[kind] = named(rows)
+        asked = [usable(kind, world, seed) for seed in range(n) for world in worlds]
+        found[kind] = named([(one.world, one.answer) for one in asked if one])
     for world in lab.offers("effect"):
-        asked, same = [first("effect", world, seed) for seed in range(n)], defaultdict(list)
-        for one in asked:
+        same = defaultdict[tuple[str, str], list[Question]](list)
+        for one in filter(None, (usable("effect", world, seed) for seed in range(n))):
             same[one.query["cause"], one.query["outcome"]].append(one)
         for many in (many for many in same.values() if len(many) > 1):
             for one in many:
@@ -215,8 +212,7 @@ def names(n: int) -> dict[str, Any]:
     }
     scores = defaultdict[str, list[float]](list)
     for world in lab.offers("graph"):
-        for seed in range(n):
-            one = first("graph", world, seed)
+        for one in filter(None, (usable("graph", world, seed) for seed in range(n))):
             causes = sorted(name for name, of in one.view.quantities.items() if of.sets)
             read = sorted(n for n in one.view.readable if n not in causes) or causes
             pairs = [[a, b] for i, a in enumerate(causes) for j, b in enumerate(read) if i != j]
@@ -322,6 +318,69 @@ def trained(steps: int) -> dict[str, Any]:
     return {"steps": steps, "CPU seconds": round(time.process_time() - begin), **rows}
 
 
+def whole(folder: Path, n: int) -> dict[str, Any]:
+    """Return figures of a made ``lab-1``, and confirm ``n`` of its public questions at random."""
+    found, rows = defaultdict[str, dict[str, Any]](dict), list[dict[str, Any]]()
+    answers = defaultdict[str, list[tuple[str, str]]](list)
+    for path in sorted(folder.glob("questions-*.parquet")):
+        part = path.stem.removeprefix("questions-")
+        about, kind = json.loads((folder / f"{part}.json").read_text())["content"], part[:-3]
+        known = found[kind]
+        for what, value in (
+            ("questions", about["rows"]),
+            ("rejected draws", sum(about["draws"])),
+            ("seeds without one", about["skipped"]),
+        ):
+            known[what] = known.get(what, 0) + value
+        for name, score in about["trivial"].items():
+            known.setdefault("trivial", defaultdict(list))[name].append(score)
+        for row in pandas.read_parquet(path).to_dict("records"):
+            rows.append(json.loads(row["spec"]))
+            if kind in ("explanation", "diagnosis") and row["level"] in ("L1", "L2"):
+                answers[kind].append((row["world"], json.loads(row["answer"])))
+    for kind, known in found.items():
+        known["trivial"] = {n: round(float(np.mean(s)), 3) for n, s in known["trivial"].items()}
+        if kind in answers:
+            known.update(named(answers[kind]))
+    picked = np.random.default_rng(0).permutation(len(rows))[:n]
+    for kind, said in confirmed([Question.of(rows[i]) for i in picked]).items():
+        found[kind].update(said)
+    return dict(found)
+
+
+def confirmed(questions: Iterable[Question]) -> dict[str, dict[str, Any]]:
+    """Return by kind in how many questions of each world the independent script agrees."""
+    found = defaultdict[str, dict[str, Any]](lambda: {"confirmed": Counter(), "not confirmed": []})
+    for one in questions:
+        said = confirm(one)
+        if said["confirmed"]:
+            found[one.kind]["confirmed"][one.world] += 1
+        else:
+            found[one.kind]["not confirmed"].append([one.spec, said])
+    return {kind: {**one, "confirmed": dict(one["confirmed"])} for kind, one in found.items()}
+
+
+def answers(n: int) -> dict[str, Any]:
+    """Confirm ``n`` random public questions of ``lab-1`` at their first usable draw.
+
+    They need not be certified: that says nothing of whether an answer is right.
+    """
+    parts = [recipe for recipe in recipes().values() if not recipe.get("private")]
+    specs = [spec for recipe in parts for spec in suites._specs(recipe)]
+    picked = [specs[i] for i in np.random.default_rng(1).permutation(len(specs))]
+    return confirmed(islice((one for spec in picked if (one := usable(**spec))), n))
+
+
+def usable(
+    kind: str, world: str, seed: int, level: str = "L2", knobs: Mapping[str, Any] | None = None
+) -> Question | None:
+    """Return the first draw of a seed that makes a question, which need not be certified."""
+    for draw in range(40):
+        with suppress(Unusable):
+            return build(kind, world, seed, level, lab.Knobs(**(knobs or {})), draw, None)
+    return None
+
+
 # --- manifests ------------------------------------------------------------------------------------
 
 
@@ -385,6 +444,8 @@ ABOUT = {
 def manifests(made: dict[str, Path]) -> None:
     """Write the manifests, with hashes, draws and trivial scores of parts that were made."""
     for name, parts in (("physics-1", tables()), ("lab-1", recipes())):
+        if made and name not in made:
+            continue
         found = {"versions": suites._here()}
         for part, recipe in parts.items():
             path = made[name] / f"{part}.json" if name in made else None
@@ -398,7 +459,7 @@ def manifests(made: dict[str, Path]) -> None:
         (MANIFESTS / f"{name}.json").write_text(text + "\n")
 
 
-PARTS = ("questions", "truth", "names", "suites", "curves", "trained")
+PARTS = ("questions", "truth", "whole", "answers", "names", "suites", "curves", "trained")
 
 
 def main() -> None:
@@ -421,6 +482,10 @@ def main() -> None:
         figures.main(["lab"])
     if given.part == "questions":
         questions(given.n, given.workers, given.rows)
+    if given.part == "answers":
+        RESULTS.write_text(as_json({**known, "answers": answers(given.n)}) + "\n")
+    if given.part == "whole":
+        RESULTS.write_text(as_json({**known, "lab-1": whole(given.made[0], given.n)}) + "\n")
     if given.part == "truth":
         rows = [json.loads(line) for line in given.rows.read_text().splitlines()]
         found = table(rows)

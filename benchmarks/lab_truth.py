@@ -15,6 +15,7 @@ import numpy as np
 
 from scm_world.lab.questions import Question
 
+TENDON = mujoco.mjtObj.mjOBJ_TENDON
 UNITS, BODIES = 100_000, 400
 """Units of equations, and of bodies."""
 ERRORS, CLOSE = 5.0, 1e-5
@@ -22,16 +23,9 @@ ERRORS, CLOSE = 5.0, 1e-5
 
 
 def confirm(question: Question) -> dict[str, Any]:
-    """Return whether the answer is confirmed; None where there is no simulation here."""
-    makers: dict[str, Any] = {
-        "equations": Equations,
-        "springs": Rig,
-        "servo": Servo,
-        "network": Network,
-    }
-    if question.world not in makers:
-        return {"confirmed": None}
-    own: Any = makers[question.world](question)
+    """Return whether the answer is confirmed, and how far off it is, in what is allowed."""
+    makers: dict[str, Any] = {"equations": Equations, "servo": Servo, "network": Network}
+    own: Any = makers.get(question.world, Rig)(question)
     query, answer = question.query, question.answer
     names = {shown: one.name for shown, one in question.view.quantities.items()}
 
@@ -42,7 +36,7 @@ def confirm(question: Question) -> dict[str, Any]:
         """Return how far a mean is from the answer, in standard errors, or in its scale."""
         shown = question.view.shown(query["outcome"], np.asarray(values, float))
         if own.exact or np.ptp(shown) == 0.0:
-            return float(abs(shown.mean() - right) / (CLOSE * question.scale))
+            return float(abs(shown.mean() - right) / (own.close * question.scale))
         error = shown.std() * np.sqrt(1.0 / units + 1.0 / shown.size)
         return float(abs(shown.mean() - right) / (ERRORS * error))
 
@@ -167,19 +161,42 @@ def _sorted(causes: Mapping[str, tuple[str, ...]]) -> list[str]:
 
 
 class Rig:
-    """A rig in plain MuJoCo: four control steps, of which the readings are summaries."""
+    """A rig in plain MuJoCo: readings are summaries of the states after its control steps."""
 
-    close = CLOSE
-    exact = False
+    exact, close = False, CLOSE
 
     def __init__(self, question: Question) -> None:
         made: Any = question.view.testbed
-        self.task, self.quantities = made.world.task, made.quantities
+        self.task, self.steps, self.question = made.world.task, made.setting["steps"], question
         self.model = mujoco.MjModel.from_xml_string(self.task.given["model"])
-        self.causes = [one for one in made.quantities if one.sets and "." in one.name]
+        # As in the package: otherwise a contact depends on the last solution, too.
+        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_WARMSTART
+        self.causes = [one for one in made.quantities if one.sets and "lamp" not in one.name]
+        self.read = [one for one in made.quantities if not one.sets]
         given = made.world.plan.at_start()
         laws = {one.name: given[one.name].function for one in self.causes if one.name in given}
         self.laws = {n: (law.weights, law.intercept) for n, law in laws.items()}
+        follows = {n: law for n, law in given.items() if n.endswith(".control")}
+        self.agent = {
+            n.partition(".")[0]: {
+                getattr(parent, "name", parent): w
+                for parent, w in zip(law.parents, np.ravel(law.function.weights), strict=True)
+            }
+            for n, law in follows.items()
+        }
+
+    def graph(self) -> tuple[set[Any], set[Any]]:
+        """Return which causes move which outcomes of the run that the question gives."""
+        view, query = self.question.view, self.question.query
+        names = {shown: one.name for shown, one in view.quantities.items()}
+        values = {names[n]: float(view.inner(n, v)) for n, v in query["set"].items()}
+        own, edges = {(names[a], names[b]) for a, b in query["known"]}, set[Any]()
+        for one in self.causes:
+            step = 1e-4 * (one.high - one.low)
+            ends = [self.one({**values, one.name: values[one.name] + s * step}) for s in (-1, 1)]
+            moved = [n.name for n in self.read if abs(ends[1][n.name] - ends[0][n.name]) > 1e-9]
+            edges |= {(one.name, outcome) for outcome in moved}
+        return edges - own, set()
 
     def one(self, values: Mapping[str, float]) -> dict[str, float]:
         """Simulate one run; return all readings."""
@@ -187,30 +204,38 @@ class Rig:
         for name, value in values.items():
             entity, _, what = name.rpartition(".")
             if what == "mass":
-                body = model.body(entity)
-                body.inertia[:] *= value / body.mass[0]
-                body.mass[:] = value
-            elif what == "stiffness":
+                model.body(entity).mass[:] = value  # its inertia stays, as the package says
+            elif what == "stiffness" and mujoco.mj_name2id(model, TENDON, entity) >= 0:
                 model.tendon_stiffness[model.tendon(entity).id] = value
+            elif what in ("stiffness", "damping"):
+                getattr(model.joint(entity), what)[0] = value
+            elif what == "friction":
+                model.geom(entity).friction[0] = value
         mujoco.mj_setConst(model, mujoco.MjData(model))
         for name, value in values.items():
             entity, _, what = name.rpartition(".")
-            if what == "velocity":
-                data.joint(entity).qvel[:] = value
+            if what in ("position", "velocity"):
+                state = data.joint(entity)
+                (state.qpos if what == "position" else state.qvel)[:] = value
         states = []
-        for _ in range(4):
+        for _ in range(self.steps):
+            for motor, weights in self.agent.items():
+                now = {n: self.state(data, n) for n in weights}
+                data.actuator(motor).ctrl[:] = sum(w * now[n] for n, w in weights.items())
             for _ in range(round(self.task.control_dt / model.opt.timestep)):
                 mujoco.mj_step(model, data)
-            states.append(data.qpos.copy())
+            states.append({one.name: self.state(data, one.reads.name) for one in self.read})
         found = dict(values)
-        for one in self.quantities:
-            entity, _, what = one.name.rpartition(".")[0].rpartition(".")
-            if what == "position" and not one.sets:
-                path = [s[model.joint(entity).qposadr[0]] for s in states]
-                found[one.name] = {"final": path[-1], "mean": np.mean(path), "max": max(path)}[
-                    one.reads.how
-                ]
+        for one in self.read:
+            path = [state[one.name] for state in states]
+            summary = {"final": path[-1], "mean": float(np.mean(path)), "max": max(path)}
+            found[one.name] = summary[one.reads.how]
         return found
+
+    def state(self, data: Any, name: str) -> float:
+        """Return the position or velocity of a joint."""
+        joint = data.joint(name.rpartition(".")[0])
+        return float((joint.qvel if name.endswith(".velocity") else joint.qpos)[0])
 
     def units(self, do: Mapping[str, float]) -> dict[str, Any]:
         """Return readings; causes that are not set follow a driver and noise of their own."""

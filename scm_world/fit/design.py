@@ -132,7 +132,7 @@ def suggested(
 ) -> tuple[Experiment, ...]:
     """Choose experiments after which the parameters have the least variance; see ``Fit.suggest``.
 
-    ``known`` are the sensitivities of the recording, shape (m, p).
+    ``known`` are the sensitivities of the recording to the numbers that are told, shape (m, p).
 
     Source:
         Chaloner and Verdinelli, *Bayesian experimental design: a review*, Statistical Science
@@ -338,7 +338,7 @@ def _best(fit: Fit, known: Floats, tried: Sequence[Candidate]) -> tuple[Candidat
             groups, begin = [[windows[w]] for w in which], [starts[w] for w in which]
             squares = LeastSquares(problem, groups, fit.noise, range(len(fit.targets)))
             made = squares.linear(fit.scaled, begin, follow=follow)
-            parts = np.split(projected(made)[1], len(numbers))
+            parts = np.split(projected(made)[1] @ fit.into, len(numbers))
             return dict(zip(numbers, parts, strict=True))
 
         def left(found: Mapping[int, Floats], i: int) -> float:

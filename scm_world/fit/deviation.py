@@ -17,6 +17,7 @@ from scm_world.fit.recordings import Begins, Noise, Reading, Recording
 from scm_world.fit.result import MISFIT, Fit
 from scm_world.fit.search import SAME, TRUST, Minima, Result, bounded, gauss_newton
 from scm_world.fit.shooting import Shooting
+from scm_world.fit.targets import numbers_of
 from scm_world.queries.progress import Progress
 from scm_world.queries.world import World
 
@@ -114,7 +115,7 @@ class Deviation:
                 fit = self.fits[names]
                 number, value, default, size = "", np.nan, 0.0, fit.squares
                 if names:
-                    most = int((np.abs(fit.scaled) / fit.errors).argmax())
+                    most = int((np.abs(fit.away(0.0 * fit.scaled)) / fit.errors).argmax())
                     target = fit.targets[most]
                     number, value, default = target.name, fit.values[target.name], target.default
             else:
@@ -376,8 +377,9 @@ class _Comparison:
     def _about(self, names: Names, size: float, scaled: Floats) -> Screened:
         """Return what the table has of a set that is not fitted."""
         active, most = self._active(names), int(np.abs(scaled).argmax())
-        target = self._targets[active[most]]
-        return size, len(active), target.name, float(target.value(scaled[most])), target.default
+        own = [self._targets[i] for i in active]
+        value, target = float(numbers_of(own, scaled)[most]), own[most]
+        return size, len(active), target.name, value, target.default
 
     def _search_thoroughly(self, best: Names) -> None:
         """Repeat the searches of the best and of the empty set, with each other's start states.

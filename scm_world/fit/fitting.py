@@ -40,7 +40,7 @@ from scm_world.fit.recordings import (
 from scm_world.fit.result import CONFIDENCE, DETERMINED, Fit
 from scm_world.fit.search import SAME, TINY, Minima, Result, gauss_newton
 from scm_world.fit.shooting import Shooting
-from scm_world.fit.targets import Target, acting, targets_of, twin_of
+from scm_world.fit.targets import Target, acting, blocks_of, targets_of, twin_of
 from scm_world.fit.thinning import thinned
 from scm_world.fit.units import check_units, reading_of
 from scm_world.queries.progress import Progress
@@ -200,7 +200,7 @@ def fitted(minima: Minima, active: Sequence[int], first: Result | None = None) -
             break
         best = minima.descended(active, best, lower)
     for other in best.others:  # as good as the best one
-        away = other[[*active]] - found.scaled
+        away = found.away(other[[*active]])
         margin = np.minimum(found.linear_reach, reach.max(axis=1))[:, None]
         reach = np.maximum(reach, np.array([-away, away]).T + margin)
     still, each = found.still[problem.measured.cells[1]], found.sensitivities**2
@@ -248,8 +248,8 @@ def covering(minima: Minima, found: Fit, others: Sequence[Minimum]) -> Fit:
     reach, blocks = np.array(found.reach), np.array_split(np.arange(windows), min(BLOCKS, windows))
     if windows > 1:
         scores = np.array([along.T @ left for left, along in (w.projected for w in found.found)])
-        sums = np.array([scores[one].sum(axis=0) for one in blocks])
-        within = sums @ spread_of(found.sensitivities)
+        sums = np.array([scores[one].sum(axis=0) for one in blocks]) @ found.into
+        within = sums @ spread_of(found.told)
         errors = np.sqrt((within**2).sum(axis=0) * len(blocks) / (len(blocks) - 1))
         far = stdtrit(len(blocks) - 1, 0.5 + 0.5 * CONFIDENCE) * errors
         reach = np.maximum(reach, far[:, None])
@@ -258,8 +258,10 @@ def covering(minima: Minima, found: Fit, others: Sequence[Minimum]) -> Fit:
             squares = LeastSquares(problem, groups, found.noise, range(p))
             others = [*others, minima.search(squares, found.scaled, starts)]
     for other in others:
-        away = other.scaled - found.scaled
-        apart = np.abs(away) > APART * other.errors * found.discount**0.5
+        apart = np.abs(other.scaled - found.scaled) > APART * other.errors * found.discount**0.5
+        for _, own in blocks_of(found.targets):
+            apart[own] = apart[own].any()
+        away = found.away(other.scaled)
         reach = np.maximum(reach, np.array([-away, away]).T * apart[:, None])
     return dataclasses.replace(found, reach=reach)
 
@@ -283,7 +285,7 @@ def _profile(
     exceed those of the fit by as much as linearised ones do at the end of a linearised interval. It
     is infinite where they do not, up to the end of the range. Where impacts make the residuals
     rough, it is not less than the linearised one; that of parameters which cannot be distinguished
-    is the linearised one.
+    is the linearised one, and so is that of an inertia, which is told in other numbers.
 
     Source:
         Bates and Watts, *Nonlinear Regression Analysis and Its Applications*, 1988, chapter 6.
@@ -294,7 +296,7 @@ def _profile(
     trials, end, most = (TRIALS, END, PROFILE) if found.explains else ROUGHLY
     ridge = (found.errors > DETERMINED) & (found.errors * alone > RIDGE * found.discount**0.5)
     for (place, i), side in itertools.product(enumerate(active), (0, 1)):
-        if ridge[place]:
+        if ridge[place] or problem.targets[i].block is not None:
             continue
         limit = problem.high[i] - middle[i] if side else middle[i] - problem.low[i]
         along = (2 * side - 1) * spread[:, place] / spread[place, place]

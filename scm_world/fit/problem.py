@@ -21,6 +21,7 @@ WINDOW = 50  # default number of rows of a window
 SHORT = 10  # number of rows of a segment
 PRIOR = 3.0  # standard deviation of scaled parameters, of which nothing is known
 STEP = 1e-4  # of finite differences, in scaled units
+ROUNDING = 1e-4  # least effect of a combination of inertias, in that of the best one
 HALVINGS = 8  # of a distance to parameters that the world refuses
 STEPS = 30  # largest number of steps of a search
 LONGEST = 2.0  # largest scaled step of a number of a start state

@@ -17,9 +17,13 @@ from scm_world._types import Floats, Integers
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.fit.design import PROBES, Experiment, suggested, unseen
 from scm_world.fit.diagnosis import Diagnosing, Diagnosis
+from scm_world.fit.inertia import LOGS
 from scm_world.fit.prediction import Prediction, predicted
 from scm_world.fit.problem import (
+    PRIOR,
+    ROUNDING,
     SHORT,
+    STEP,
     WINDOW,
     LinearWindow,
     Outlier,
@@ -45,8 +49,11 @@ from scm_world.fit.shooting import Shooting
 from scm_world.fit.targets import (
     FAR,
     Target,
+    blocks_of,
     delays_of,
+    drawn_of,
     free_states,
+    numbers_of,
     posterior_of,
     ranges_of,
     twin_of,
@@ -73,6 +80,7 @@ AWAY = 0.5  # of the spread of a state in the recording, at which it is far from
 WORSE = 1.1  # times the error of the unfitted world, with which a fit replays worse than it
 LEFT = 0.5  # share of the variance within windows that a fit leaves which does not follow them
 SHOWN = 5  # outliers that are named
+SHARE = 0.01  # least one of an undetermined combination in a number without an interval
 MAIN = 0.3  # least share of a parameter in a combination that is named
 DRAWN = 8  # columns of a picture
 
@@ -93,7 +101,8 @@ class Fit:
         given: Columns whose noise was given, shape (columns,).
         found: The windows, linearised at the fit.
         spans: Size of a scaled unit of each free number of a start state, shape (k,).
-        reach: How far the intervals reach down and up, scaled, shape (p, 2); None if linearised.
+        reach: How far the intervals reach down and up, scaled, those of an inertia in the numbers
+            that are told, shape (p, 2); None if linearised.
         shortened: Whether the windows are shorter than usual because segments did not join.
         ended: Whether the search took all its steps before it found a minimum.
         interrupted: Whether Ctrl-C ended the search; intervals are linearised, none is determined.
@@ -147,8 +156,8 @@ class Fit:
     @property
     def values(self) -> dict[str, float]:
         """The fitted values, by name."""
-        pairs = zip(self.targets, self.scaled, strict=True)
-        return {target.name: float(target.value(number)) for target, number in pairs}
+        found = numbers_of(self.targets, self.scaled).tolist()
+        return dict(zip((target.name for target in self.targets), found, strict=True))
 
     @cached_property
     def world(self) -> World:
@@ -275,25 +284,82 @@ class Fit:
 
     @cached_property
     def covariance(self) -> Floats:
-        """Covariance of the scaled parameters, shape (p, p), without undetermined directions.
+        """Covariance of the numbers that are told, shape (p, p), without undetermined directions.
 
-        It is that of linearised least squares, times the discount for correlated residuals.
+        It is that of linearised least squares, times the discount for correlated residuals. Of an
+        inertia some directions always are undetermined: the error of these is that of the prior.
         """
-        sizes, directions = self._directions(self.sensitivities)
+        sizes, directions = self._directions(self.told)
         errors = np.sqrt(self.discount) / np.maximum(sizes, 1e-12)
+        errors[self._open(sizes)] = PRIOR
         return np.asarray((directions.T * errors**2) @ directions)
+
+    def _open(self, sizes: Floats) -> NDArray[np.bool_]:
+        """Return which directions no measurement shows, if there are inertias, shape (p,).
+
+        Their differences have errors, which noise does not hide where it is little.
+        """
+        least = max(np.sqrt(self.discount) / PRIOR, ROUNDING * sizes.max(initial=0.0))
+        return np.asarray((sizes < least) & bool(blocks_of(self.targets)))
+
+    @cached_property
+    def units(self) -> Floats:
+        """Sizes of the numbers of an inertia, see ``Inertial.units``, and 1 of others, (p,)."""
+        found = np.ones(len(self.scaled))
+        for block, own in blocks_of(self.targets):
+            found[own] = block.units(self.scaled[own])
+        return found
+
+    @cached_property
+    def into(self) -> Floats:
+        """Derivatives of the scaled numbers by those that are told, shape (p, p).
+
+        Told are the ten parameters of an inertia in ``Inertial.units``; others are as scaled. The
+        differences are those of the sensitivities, so that both have one error.
+        """
+        found = np.eye(len(self.scaled))
+        for block, own in blocks_of(self.targets):
+            at, both = self.scaled[own], STEP * np.eye(10)
+            steps = [block.numbers(at + one) - block.numbers(at - one) for one in both]
+            slopes = np.array(steps).T / (2.0 * STEP * self.units[own, None])
+            found[own, own] = np.linalg.inv(slopes)
+        return found
+
+    @cached_property
+    def told(self) -> Floats:
+        """Derivatives of the residuals by the numbers that are told, shape (n, p)."""
+        return np.asarray(self.sensitivities @ self.into)
 
     @property
     def errors(self) -> Floats:
-        """Standard errors of the scaled parameters, shape (p,)."""
+        """Standard errors of the numbers that are told, scaled, shape (p,)."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
     def linear_reach(self) -> Floats:
-        """How far the intervals of linearised least squares reach, scaled, shape (p,)."""
+        """How far the intervals of linearised least squares reach, scaled, shape (p,).
+
+        Those of an inertia are of the numbers that are told: motion is almost linear in these. They
+        are infinite where an undetermined combination has a share.
+
+        Source:
+            Atkeson, An and Hollerbach, *Estimation of inertial parameters of manipulator loads and
+            links*, International Journal of Robotics Research 1986: linear, and partly unseen.
+        """
         from scipy.special import stdtrit
 
-        return np.asarray(stdtrit(self.degrees, 0.5 + 0.5 * CONFIDENCE) * self.errors)
+        found = stdtrit(self.degrees, 0.5 + 0.5 * CONFIDENCE) * self.errors
+        sizes, directions = self._directions(self.told)
+        shares = np.linalg.norm(directions[self._open(sizes)], axis=0)
+        inner = np.array([target.block is not None for target in self.targets], bool)
+        return np.where(inner & (shares > SHARE), np.inf, found)
+
+    def away(self, other: Floats) -> Floats:
+        """Return how far other scaled numbers are away, in the numbers that are told, (p,)."""
+        found = other - self.scaled
+        for block, own in blocks_of(self.targets):
+            found[own] = block.numbers(other[own]) - block.numbers(self.scaled[own])
+        return found / self.units
 
     @cached_property
     def table(self) -> pd.DataFrame:
@@ -302,18 +368,20 @@ class Fit:
         A row has ``parameter``, ``value``, ``low`` and ``high`` of the 95 % interval, ``default``,
         ``deviation`` (value : default - 1; NaN if the default is zero), ``unit``, and whether the
         parameter is ``determined``: the width of its interval is at most its value or its scale
-        (that of a positive parameter, a factor of e), or the interval begins at the end of the
-        range and is below the default: at most this. ``low`` and ``high`` are NaN where there is no
-        interval: where it would be the whole range.
+        (that of a positive parameter, a factor of e; that of an inertial one, see
+        ``Inertial.units``), or the interval begins at the end of the range and is below the
+        default: at most this. ``low`` and ``high`` are NaN where there is no interval: where it
+        would be the whole range.
         """
         import pandas as pd
 
         linear = np.repeat(self.linear_reach[:, None], 2, axis=1)
         reach, rows = linear if self.reach is None else self.reach, []
         unsure = self.ended or self.interrupted or self.worse or self.aimless
-        for target, number, (down, up) in zip(self.targets, self.scaled, reach, strict=True):
-            value, ends = float(target.value(number)), np.array([number - down, number + up])
-            open_ends = ends <= target.low, ends >= target.high
+        about = zip(self.targets, self.scaled, reach, self.values.values(), strict=True)
+        for i, (target, number, (down, up), value) in enumerate(about):
+            ends = np.array([number - down, number + up])
+            open_ends = bool(ends[0] <= target.low), bool(ends[1] >= target.high)
             low, high = target.value(np.clip(ends, target.low, target.high))
             if target.log:
                 low, high = 0.0 if ends[0] <= -FAR else low, np.inf if ends[1] >= FAR else high
@@ -321,9 +389,14 @@ class Fit:
             else:
                 low, high = sorted((float(low), float(high)))
                 width, most = (high - low) / target.scale, max(abs(value) / target.scale, 1.0)
-            at_most = open_ends[0][0] and high <= target.default
+            at_most = open_ends[0] and high <= target.default
             determined = bool((width <= most or at_most) and not unsure)
-            if open_ends[0][0] and open_ends[1][1]:
+            if target.block is not None:
+                low, high = value - down * self.units[i], value + up * self.units[i]
+                low = max(low, 0.0) if target.component in LOGS else low
+                determined = bool(down + up <= 1.0 and not unsure)
+                open_ends = (max(down, up) == np.inf,) * 2
+            if all(open_ends):
                 low, high, determined = np.nan, np.nan, False
             deviation = value / target.default - 1.0 if target.default else np.nan
             ends_of_it = (value, float(low), float(high), target.default)
@@ -339,20 +412,24 @@ class Fit:
         standard deviations of their noise by a scaled unit), the ``standard_error`` in scaled
         units, whether it is ``determined``, its main ``parameters``, and the ``combination`` in
         words. A scaled unit of a positive parameter is that of its logarithm: 0.1 is 10 %. That of
-        another one is its value or its scale, whichever is larger.
+        another one is its value or its scale, whichever is larger; that of an inertial parameter
+        is its size in ``Inertial.units``.
         """
         import pandas as pd
 
-        units = np.where([t.log for t in self.targets], 1.0, np.maximum(np.abs(self._sizes), 1.0))
-        rows = []
-        for size, found in zip(*self._directions(self.sensitivities * units), strict=True):
+        plain = [t.log or t.block is not None for t in self.targets]
+        units = np.where(plain, 1.0, np.maximum(np.abs(self._sizes), 1.0))
+        sizes, directions = self._directions(self.told * units)
+        rows, seen = [], ~self._open(sizes)
+        for size, found, shown in zip(sizes, directions, seen, strict=True):
             error = float(np.sqrt(self.discount) / max(size, 1e-12))
             direction = found * np.sign(found[np.abs(found).argmax()])
             order = np.argsort(-np.abs(direction), kind="stable")
             main = [i for i in order if abs(direction[i]) >= MAIN]
             names = tuple(self.targets[i].name for i in main)
             words = " ".join(f"{direction[i]:+.2f} {self.targets[i].name}" for i in main)
-            rows.append((float(size), error, error <= DETERMINED, names, words.removeprefix("+")))
+            sure = bool(shown and error <= DETERMINED)
+            rows.append((float(size), error, sure, names, words.removeprefix("+")))
         columns = ["singular_value", "standard_error", "determined", "parameters", "combination"]
         return pd.DataFrame(rows, columns=columns)
 
@@ -380,9 +457,10 @@ class Fit:
     @property
     def _seen(self) -> NDArray[np.bool_]:
         """Whether each parameter changes a measurement of the recording, shape (p,)."""
-        return np.asarray(
-            np.any([np.abs(one.parameters).max(axis=0) for one in self.found], axis=0)
-        )
+        seen = np.any([np.abs(one.parameters).max(axis=0) for one in self.found], axis=0)
+        for _, own in blocks_of(self.targets):
+            seen[own] = seen[own].any()
+        return np.asarray(seen)
 
     @property
     def _sizes(self) -> Floats:
@@ -539,9 +617,12 @@ class Fit:
 
         They are drawn together, from the normal distribution of the scaled parameters that
         ``counterfactual`` uses, within their ranges: ``start=fit.posterior()`` of an environment
-        randomises by what was not determined. A delay is not among them.
+        randomises by what was not determined. A delay is not among them. Of an inertia the
+        logarithms of the mass and of second moments, the center, and a turn of the axes are drawn.
         """
-        return posterior_of(self.targets, self.scaled, self.spread)
+        targets, scaled, into = drawn_of(self.targets, self.scaled)
+        along = self.sensitivities @ into / np.sqrt(self.discount)
+        return posterior_of(targets, scaled, spread_of(along))
 
     @typed
     def diagnose(
@@ -659,7 +740,8 @@ class Fit:
         about = zip(self.targets, self.scaled, ends, sure, strict=True)
         found += self._about_residuals + self._far_starts
         for target, number, (low, high), determined in about:
-            if determined and low <= target.value(target.low) < target.value(number):
+            positive = target.block is None
+            if determined and positive and low <= target.value(target.low) < target.value(number):
                 unit = f" {target.unit}" * (target.unit not in ("", "1"))
                 found.append(f"{target.name} is at most {high:.3g}{unit}")
             near = 1e-3 * min(1.0, target.high - target.low)
@@ -791,7 +873,7 @@ class Fit:
         """
         longest = max(len(run.commands) for run in self.runs)
         count = longest if steps is None else steps
-        known = self.sensitivities / np.sqrt(self.discount)
+        known = self.told / np.sqrt(self.discount)
         how: dict[str, Any] = {"steps": count, "limits": limits, "seed": seed, "setups": setups}
         return suggested(self, known, n, **how)
 

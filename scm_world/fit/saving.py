@@ -15,6 +15,7 @@ import numpy as np
 from scm_world._arguments import load
 from scm_world._types import Floats
 from scm_world.errors import ModelError, ScmWorldError, UnknownOption
+from scm_world.fit.inertia import AXES, PARTS
 from scm_world.fit.targets import LATE, twin_of, values_of
 from scm_world.runs.canvas import png
 from scm_world.runs.files import write_whole
@@ -29,7 +30,9 @@ GENERAL = ("kp", "kv", "gain", "bias", "timeconst")  # what arrays of <general> 
 STYLE = "body{font:16px/1.5 sans-serif;max-width:60em;margin:2em auto;padding:0 1em}"
 STYLE += "table{border-collapse:collapse}td,th{padding:.2em .8em;text-align:right}img{width:100%}"
 OTHER = r"<!--.*?-->|<(sensor|equality|keyframe)\b[^>/]*>.*?</\1>|<(?:site|camera|light)\b[^>]*>"
-MJCF = {"inertia": "diaginertia", "center_of_mass": "pos", "anchor": "pos"}  # other names there
+MJCF = {"inertia": "diaginertia", "center_of_mass": "pos", "principal_axes": "quat"}
+MJCF["anchor"] = "pos"  # other names there
+TURNED = r"\s*\b(?:fullinertia|axisangle|euler|xyaxes|zaxis)\s*=\s*([\"']).*?\1"
 ANGLES = ("range", "ref", "springref")  # of hinges, in degrees unless the compiler says radians
 INSIDE = {"mass": ("mass", "value"), "damping": ("dynamics", "damping")}
 INSIDE["frictionloss"] = ("dynamics", "friction")  # of URDF: a child and its attribute
@@ -140,23 +143,26 @@ def _with(text: str, name: str, values: Mapping[str, Floats], mj: Any, unit: str
             child = f'<{child} {attribute}="{_written(values[name])}"/>'
             return f"{text[: tag.end()]}{child}{text[tag.end() :]}"
         tag = inner
-    elif attribute in ("mass", "inertia", "center_of_mass") and tag[1] == "body":
+    elif attribute in PARTS and tag[1] == "body":
         inner = re.compile(r"<inertial\b[^>]*>|</?body\b").search(hidden, tag.end())
         about = mj.body(element)
         if inner is None or not inner[0].startswith("<inertial"):
             parts = {"pos": about.ipos, "quat": about.iquat, "mass": about.mass}
             parts["diaginertia"] = about.inertia
-            for name in ("mass", "inertia", "center_of_mass"):
-                if (value := values.get(f"{element}.{name}")) is not None:
-                    parts[MJCF.get(name, name)] = value
+            for part in PARTS:
+                if (value := values.get(f"{element}.{part}")) is not None:
+                    parts[MJCF.get(part, part)] = value if part != AXES else np.roll(value, 1)
             words = " ".join(f'{key}="{_written(numbers)}"' for key, numbers in parts.items())
             return f"{text[: tag.end()]}<inertial {words}/>{text[tag.end() :]}"
         tag = inner
     first, last = tag.span()
     changed, value = text[first:last], values[name]
-    if attribute == "inertia" and re.search(r"\bfullinertia\s*=", changed):
-        changed = re.sub(r"\s*\bfullinertia\s*=\s*([\"']).*?\1", "", changed, flags=re.S)
-        changed = _replaced(changed, "quat", mj.body(element).iquat)  # its principal axes
+    if attribute == AXES or (attribute == "inertia" and re.search(r"\bfullinertia\s*=", changed)):
+        about = mj.body(element)  # moments and axes together replace what else says them
+        changed = re.sub(TURNED, "", changed, flags=re.S)
+        axes = np.roll(values.get(f"{element}.{AXES}", np.roll(about.iquat, -1)), 1)
+        changed = _replaced(changed, MJCF[AXES], axes)
+        value, attribute = values.get(f"{element}.inertia", about.inertia), "inertia"
     if changed.startswith("<general") and attribute in GENERAL:
         for array, numbers in _general(element, values, mj).items():
             changed = _replaced(changed, array, numbers)
@@ -197,7 +203,7 @@ def _tags(hidden: str, element: str, attribute: str) -> list[re.Match[str]]:
     named = re.compile(rf"<(\w+)\b[^>]*?\bname\s*=\s*[\"']{re.escape(element)}[\"'][^>]*>")
     found = [*named.finditer(hidden)]
     bodies = [tag for tag in found if tag[1] in ("body", "link")]
-    if attribute in ("mass", "inertia", "center_of_mass"):
+    if attribute in PARTS:
         return bodies
     others = (tag for tag in found if tag not in bodies)
     return [tag for tag in others if (tag[1] in ("joint", "geom")) != (attribute in DRIVEN)]

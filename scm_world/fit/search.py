@@ -11,6 +11,8 @@ import numpy as np
 from scm_world._types import Floats, Integers
 from scm_world.fit.problem import (
     PRIOR,
+    ROUNDING,
+    STEP,
     FitProblem,
     LeastSquares,
     LinearWindow,
@@ -22,6 +24,7 @@ from scm_world.fit.problem import (
     projected,
     windows_of,
 )
+from scm_world.fit.targets import blocks_of
 
 SEARCHES = 6  # largest number of searches for the best minimum
 SAME = 3.0  # largest difference of the loss of equal minima
@@ -71,13 +74,14 @@ def gauss_newton(squares: LeastSquares, scaled: Floats, starts: Sequence[Floats]
     owner = np.repeat(np.arange(len(groups)), counts)
     low, high, weights = problem.low[active], problem.high[active], np.zeros(len(groups))
     scaled, starts, made = scaled.copy(), [*starts], list[LinearWindow]()
+    rounding = ROUNDING * bool(blocks_of(problem.targets))
     (sizes,), (gaps,), (ends,) = squares.sizes(scaled, [starts])
     slow, smooth, trust = 0, False, TRUST
     for number in range(squares.most):
         made = squares.linear(scaled, starts)
         residual, along = projected(made)
         here = scaled[active]
-        step = bounded(residual, along, low - here, high - here, trust)
+        step = bounded(residual, along, low - here, high - here, trust, rounding)
         left = np.array([((r + g @ step) ** 2).sum() for r, g in (one.projected for one in made)])
         least = 2.0 * (left - sizes) / np.where(gaps > TINY, gaps, 1.0)
         weights = np.where(gaps > TINY, np.maximum(weights, least), weights)
@@ -130,11 +134,17 @@ def _following(
 
 
 def bounded(
-    residual: Floats, along: Floats, low: Floats, high: Floats, trust: float = np.inf
+    residual: Floats,
+    along: Floats,
+    low: Floats,
+    high: Floats,
+    trust: float = np.inf,
+    rounding: float = 0.0,
 ) -> Floats:
     """Return the step of scaled parameters, between ends, that leaves the least squares.
 
-    Where the residuals do not change, the step is none: its length has a small weight.
+    Where the residuals do not change, the step is none: its length has a small weight, which is
+    not less than the errors of derivatives in their size (``rounding``).
 
     Source:
         Rockafellar, *Monotone operators and the proximal point algorithm*, SIAM Journal on Control
@@ -143,7 +153,8 @@ def bounded(
     from scipy.optimize import lsq_linear
 
     p = len(low)
-    stacked = np.vstack([along, np.eye(p) / PRIOR])
+    weight = max(1.0 / PRIOR, rounding * float(np.linalg.norm(along))) if p else 0.0
+    stacked = np.vstack([along, weight * np.eye(p)])
     small = np.linalg.qr(np.column_stack([stacked, -np.append(residual, np.zeros(p))])).R
     ends = np.maximum(low, -trust), np.minimum(high, trust)
     step = np.linalg.lstsq(small[:p, :p], small[:p, p], rcond=None)[0]
@@ -398,15 +409,27 @@ class Minima:
     def certain(self, best: Result, active: Sequence[int]) -> list[LinearWindow]:
         """Return the linearised windows, or others over wide steps that determine less.
 
-        Where an impact comes or goes within a small step, derivatives would be far too large.
+        Where an impact comes or goes within a small step, derivatives would be far too large. Of an
+        inertia some combinations never act, which differences to both sides show.
         """
         at = best.at
-        if best.smooth or not active:
-            return at.made
         linear = LeastSquares(self.problem, self.problem.windows, best.noise, active).linear
+        made = at.made
+        if blocks_of(self.problem.targets) and active:
+            back = linear(at.scaled, at.starts, step=-STEP, of_states=-STEP)
+            made = [
+                dataclasses.replace(
+                    one,
+                    states=0.5 * (one.states + other.states),
+                    parameters=0.5 * (one.parameters + other.parameters),
+                )
+                for one, other in zip(made, back, strict=True)
+            ]
+        if best.smooth or not active:
+            return made
         wide = (linear(at.scaled, at.starts, step=one, of_states=one) for one in (WIDE, -WIDE))
         chosen = []
-        for each in zip(at.made, *wide, strict=True):
+        for each in zip(made, *wide, strict=True):
             sizes = np.array([np.linalg.norm(one.projected[1]) for one in each])
             one = each[int(sizes.argmin())] if sizes.min() < LESS * sizes[0] else each[0]
             chosen.append(dataclasses.replace(one, residual=each[0].residual))

@@ -123,7 +123,7 @@ class Shooting(Simulator):
         self._setups = [*dict.fromkeys(tuple(run.do.items()) for run in self.runs)]
         names = {self._places_of[label][0] for setup in self._setups for label, _ in setup}
         self._usual = {name: np.array(first[name], float) for name in names}
-        written = names.union(t.variable for t in targets if t.values is not None)
+        written = names.union(*(t.written for t in targets))
         acting = written.union(*map(first.model.descendants, written))
         follow = [name for name in first.compiled.static_names if name in acting]
         keys = first.compiled.parameter_keys

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
+from itertools import chain
 from typing import final
 
 import numpy as np
@@ -13,10 +15,22 @@ import numpy as np
 from scm_world._patterns import as_names, fits, fitting
 from scm_world._types import ArrayLike, Floats, Integers
 from scm_world.errors import NotIntervenable, UnknownOption, UnknownVariable
+from scm_world.fit.inertia import (
+    INERTIAL,
+    LOGS,
+    NUMBERS,
+    PARTS,
+    SECOND,
+    Inertial,
+    swapped,
+    ten_numbers,
+    turn_from,
+    turned_by,
+)
 from scm_world.fit.recordings import MeasuredNumber, labels, settable_of
 from scm_world.queries.twins import twins_of
 from scm_world.queries.world import World
-from scm_world.variables import Box
+from scm_world.variables import Box, Variable
 from scm_world.variables.distributions import Normal
 from scm_world.variables.interventions import Mechanism
 from scm_world.world import Simulation
@@ -26,7 +40,10 @@ LATE = "_delay"  # after the name of an action: the delay of one command [contro
 TIMESTEP = "timestep"  # a setting of the engine, which no robot has
 LONGEST_DELAY = 20.0  # [control steps]
 UNSEEN = 0.1  # scale of a parameter that is zero, if nothing shows a better one
+LIGHTEST = 1e-8  # least mass [kg] and second moment [kg m²] of an inertia that is drawn
 FAR = 12.0  # largest logarithm of a positive parameter, relative to its default
+
+Form = Callable[[Floats], Floats]
 
 
 @final
@@ -47,6 +64,10 @@ class Target:
         whole: Whether all components keep their proportions to this one: those of an inertia, or
             the two ends of a symmetric range.
         values: All numbers of the variable in the world; None for a delay, which the world lacks.
+        block: The inertia of which it is one of ten numbers, one after another. It is searched in
+            the numbers of the block, and told in those of ``Inertial.numbers``.
+        forms: What turns values of the variable into those of which it is a component, and back,
+            where these can have any value.
     """
 
     name: str
@@ -60,6 +81,15 @@ class Target:
     high: float
     whole: bool = False
     values: Floats | None = None
+    block: Inertial | None = None
+    forms: tuple[Form, Form] = (np.asarray, np.asarray)
+
+    @property
+    def written(self) -> tuple[str, ...]:
+        """Names of the variables that it sets."""
+        if self.block is not None:
+            return tuple(self.block.values(np.zeros(10)))
+        return () if self.values is None else (self.variable,)
 
     def value(self, scaled: ArrayLike) -> Floats:
         """Return the value of a scaled number, or the values of an array of them."""
@@ -102,7 +132,7 @@ class Conditional:
         values = np.broadcast_to(usual, (*lead, *usual.shape)).copy().reshape(*lead, -1)
         drawn = np.reshape(noise, (*lead, -1))[..., : len(self.own)] @ self.root.T + self.middle
         for i, (place, target) in enumerate(self.before):
-            there = np.reshape(parents[place], (*lead, -1))[..., target.component]
+            there = np.reshape(target.forms[0](parents[place]), (*lead, -1))[..., target.component]
             drawn = drawn + (target.scaled(there) - self.others[i])[..., None] * self.slope[:, i]
         for i, target in enumerate(self.own):
             value = target.value(np.clip(drawn[..., i], target.low, target.high))
@@ -110,7 +140,52 @@ class Conditional:
                 values = values * (value / values[..., target.component])[..., None]
             else:
                 values[..., target.component] = value
-        return np.asarray(values.reshape((*lead, *usual.shape)))
+        return np.asarray(self.own[0].forms[1](values.reshape((*lead, *usual.shape))))
+
+
+def _drawn(block: Inertial, at: Floats) -> tuple[list[Target], Floats]:
+    """Return numbers of an inertia whose normal distribution has only bodies that can exist.
+
+    They are the logarithms of the mass and of the second moments along the principal axes, the
+    center of mass, and the vector of a turn of these axes. Returned are also the derivatives of the
+    searched numbers by them, shape (10, 10).
+    """
+    mass, center, moments, axes = block.body(at)
+    turn = partial(turn_from, axes), partial(turned_by, axes)
+    means = np.asarray(mass), center, swapped(moments, 0.5), np.zeros(3)
+    plain: tuple[Form, Form] = np.asarray, np.asarray
+    forms: tuple[tuple[Form, Form], ...] = plain, plain, (SECOND, swapped), turn
+    found = list[Target]()
+    for name, mean, form in zip(block.values(at), means, forms, strict=True):
+        for i, value in enumerate(np.ravel(mean).tolist()):
+            log = name.endswith((".mass", ".inertia"))
+            scale = block.length if mean is center else 1.0
+            low, high = (math.log(LIGHTEST / value), FAR) if log else (-math.inf, math.inf)
+            about = name, name, i, "", value, scale, log, low, high, False, np.asarray(mean)
+            found.append(Target(*about, forms=form))
+
+    def searched(by: Floats) -> Floats:
+        values = np.array([float(t.value(n)) for t, n in zip(found, by, strict=True)])
+        body = values[0], values[1:4], swapped(values[4:7]), turned_by(axes, values[7:])
+        return np.asarray(block.searched(ten_numbers(*body)))
+
+    steps = 1e-5 * np.eye(10)
+    slopes = np.array([(searched(one) - searched(-one)) / 2e-5 for one in steps]).T
+    return found, slopes
+
+
+def drawn_of(
+    targets: Sequence[Target], scaled: Floats
+) -> tuple[tuple[Target, ...], Floats, Floats]:
+    """Return numbers that can be drawn, scaled, and derivatives of the given ones by them, (p, p).
+
+    They are the given ones, but for inertias.
+    """
+    found, numbers, into = [*targets], scaled.copy(), np.eye(len(scaled))
+    for block, own in blocks_of(targets):
+        found[own], into[own, own] = _drawn(block, scaled[own])
+        numbers[own] = 0.0
+    return tuple(found), numbers, into
 
 
 def posterior_of(targets: Sequence[Target], scaled: Floats, spread: Floats) -> dict[str, Mechanism]:
@@ -153,14 +228,30 @@ def twin_of(world: World) -> Iterator[Simulation]:
 def values_of(targets: Sequence[Target], scaled: Floats) -> dict[str, Floats]:
     """Return the values of the variables of scaled numbers, shape (p,), by name."""
     found = dict[str, Floats]()
-    for target, number in zip(targets, scaled, strict=True):
-        if target.values is not None:
+    for i, (target, number) in enumerate(zip(targets, scaled, strict=True)):
+        if target.block is not None:
+            found |= {} if target.component else target.block.values(scaled[i : i + 10])
+        elif target.values is not None:
             values = found.setdefault(target.variable, target.values.copy()).reshape(-1)
             if target.whole:
                 values *= target.value(number) / values[target.component]
             else:
                 values[target.component] = target.value(number)
     return found
+
+
+def numbers_of(targets: Sequence[Target], scaled: Floats) -> Floats:
+    """Return the numbers that are told of scaled numbers, shape (p,) each."""
+    found = np.array([float(t.value(n)) for t, n in zip(targets, scaled, strict=True)])
+    for block, own in blocks_of(targets):
+        found[own] = block.numbers(scaled[own])
+    return found
+
+
+def blocks_of(targets: Sequence[Target]) -> list[tuple[Inertial, slice]]:
+    """Return the inertias among some targets, each with the places of its ten numbers."""
+    firsts = ((t.block, i) for i, t in enumerate(targets) if not t.component)
+    return [(block, slice(i, i + 10)) for block, i in firsts if block is not None]
 
 
 def delays_of(world: Simulation, targets: Sequence[Target], scaled: Floats) -> Floats:
@@ -199,7 +290,8 @@ def targets_of(
 
     A parameter that cannot be negative is scaled by its logarithm, any other one by its default, or
     the largest component of its vector; ``Shooting.seen`` scales those that are zero. An inertia
-    keeps the proportions of its components, unless these are named.
+    keeps the proportions of its components, unless these are named. ``"link.inertial"`` names mass,
+    center of mass, and inertia with its axes as one block, of which other names then have no part.
 
     Args:
         world: A twin of the world, at the beginning of an episode.
@@ -222,9 +314,14 @@ def targets_of(
     late = [*(f"{name}{LATE}" for name in world.compiled.actions), DELAY]
     late = [name for name in late if name not in model and world.compiled.n_actions]
     held = [name for name in world.compiled.actions if f"{name}_past" in model]
+    blocks = dict[str, list[str]]()
     for pattern in given:
         if not isinstance(pattern, str):
             raise UnknownVariable(pattern, known)
+        if inertials := _inertials(pattern, known, refused):
+            blocks |= inertials
+            names |= dict.fromkeys(inertials)
+            continue
         if pattern in refused:
             raise NotIntervenable(pattern, str(refused[pattern]))
         if pattern in model and pattern not in known:
@@ -242,6 +339,8 @@ def targets_of(
             joint = name not in known or name in mirrored or _kind(world, name) == "inertia"
             parts_of_it = (name,) if joint else labels(name, model.declared(name).shape)
             names |= dict.fromkeys(parts_of_it)
+    inner = {*chain(*blocks.values())}
+    names = {n: None for n in names if known.get(n, parts.get(n)) not in inner}
     if symmetric and mirrored.isdisjoint(names):
         raise UnknownOption("symmetric", True, (f"a range [-a, a] among {', '.join(names)}",))
     targets = []
@@ -250,26 +349,66 @@ def targets_of(
             unit, one = ("s", world.options.control_period) if name == DELAY else ("1", 1.0)
             targets.append(Target(name, name, 0, unit, 0.0, one, False, 0.0, LONGEST_DELAY))
             continue
+        if name in blocks:
+            targets += _ten(name, {p: world[n] for p, n in zip(PARTS, blocks[name], strict=True)})
+            continue
         whole = name in mirrored or (name in known and _kind(world, name) == "inertia")
         variable = model.declared(known.get(name) or parts[name])
-        values = np.array(world[variable.name], dtype=float)
-        vector = values.ravel()
-        place = int(vector.argmax()) if whole else labels(variable.name, variable.shape).index(name)
-        default, low, high = float(vector[place]), -np.inf, np.inf
-        if isinstance(variable.bounds, Box):
-            ends = variable.bounds.bounds(variable.shape, world.evaluate(()))
-            low, high = (float(np.ravel(end)[place]) for end in ends)
-        low = 0.0 if name in mirrored else low
-        scale = abs(default) or float(np.abs(vector).max()) or UNSEEN
-        log = low >= 0.0 and default > 0.0
-        if log:
-            least, most = (math.log(max(end, 1e-300) / default) for end in (low, high))
-            low, high = max(least, -FAR), min(most, FAR)
-        else:
-            low, high = (low - default) / scale, (high - default) / scale
-        about = (name, variable.name, place, variable.unit, default, scale)
-        targets.append(Target(*about, log, low, high, whole, values))
+        targets.append(_single(world, name, variable, whole, name in mirrored))
     return tuple(targets)
+
+
+def _single(
+    world: Simulation, name: str, variable: Variable, whole: bool, symmetric: bool
+) -> Target:
+    """Return a number of a parameter."""
+    values = np.array(world[variable.name], dtype=float)
+    vector = values.ravel()
+    place = int(vector.argmax()) if whole else labels(variable.name, variable.shape).index(name)
+    default, low, high = float(vector[place]), -np.inf, np.inf
+    if isinstance(variable.bounds, Box):
+        ends = variable.bounds.bounds(variable.shape, world.evaluate(()))
+        low, high = (float(np.ravel(end)[place]) for end in ends)
+    low = 0.0 if symmetric else low
+    scale = abs(default) or float(np.abs(vector).max()) or UNSEEN
+    log = low >= 0.0 and default > 0.0
+    if log:
+        least, most = (math.log(max(end, 1e-300) / default) for end in (low, high))
+        low, high = max(least, -FAR), min(most, FAR)
+    else:
+        low, high = (low - default) / scale, (high - default) / scale
+    about = (name, variable.name, place, variable.unit, default, scale)
+    return Target(*about, log, low, high, whole, values)
+
+
+def _inertials(
+    pattern: str, known: Collection[str], refused: Mapping[str, str]
+) -> dict[str, list[str]]:
+    """Return the inertias that a pattern names, with the variables of each.
+
+    Raises:
+        NotIntervenable: It names some, and each has a variable that cannot be set.
+    """
+    if pattern in known or not pattern.endswith(INERTIAL):
+        return {}
+    bodies = (n.removesuffix(".mass") for n in (*known, *refused) if n.endswith(".mass"))
+    every = {f"{body}{INERTIAL}": [f"{body}.{part}" for part in PARTS] for body in bodies}
+    named = {name: own for name, own in every.items() if fits(name, (pattern,))}
+    found = {name: own for name, own in named.items() if {*own} <= {*known}}
+    for name, own in named.items() if not found else ():
+        why = (f"{n}, which {refused.get(n, 'cannot be set')}" for n in own if n not in known)
+        raise NotIntervenable(name, f"is not known without {', and without '.join(why)}")
+    return found
+
+
+def _ten(name: str, values: Mapping[str, ArrayLike]) -> Iterator[Target]:
+    """Return the ten numbers of the inertia of a body."""
+    block = Inertial.of(name, values)
+    usual = block.numbers(np.zeros(10))
+    for i, (label, unit) in enumerate(NUMBERS.items()):
+        end = FAR if i in LOGS else math.inf
+        about = f"{name}.{label}", name, i, unit, float(usual[i]), 1.0, False, -end, end
+        yield Target(*about, False, usual, block)
 
 
 def acting(world: Simulation, columns: Iterable[MeasuredNumber]) -> list[str]:

@@ -19,7 +19,7 @@ from scm_world.errors import ModelError, UnknownOption
 from scm_world.lab.expressions import FORM, evaluate
 from scm_world.lab.worlds import RIGS, WORLDS, Knobs, Testbed, acted, testbed
 from scm_world.queries import Episode, Laboratory, Plan
-from scm_world.variables import Box, Draw, Hard
+from scm_world.variables import Box, Draw, Hard, Linear, Mechanism
 
 LEVELS: Mapping[str, str] = {
     "L1": "names, units and a description",
@@ -125,8 +125,14 @@ class LevelView:
         for name, value in do.items():
             one, many = self.quantities[name], np.ravel(value)
             ends = sorted((one.factor * self.inner(name, many)).tolist())
-            times = {"at": at} if at else {}
-            act = Hard(ends[0], **times) if len(ends) == 1 else Draw(Box(*ends), **times)
+            times: dict[str, Any] = {"at": at} if at else {}
+            act: Any = Hard(ends[0], **times)
+            if len(ends) == 2 and one.aim:  # a command would be drawn in each step
+                slope = (ends[1] - ends[0]) / (one.high - one.low)
+                law = Linear(weights=(slope,), intercept=ends[0] - slope * one.low)
+                act = Mechanism(law, parents=(one.aim,), **times)
+            elif len(ends) == 2:
+                act = Draw(Box(*ends), **times)
             found[str(one.sets)] = act
         return found
 

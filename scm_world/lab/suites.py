@@ -179,8 +179,8 @@ class Suite:
         cells = {f"{name}.json": (name, recipe) for name, recipe in parts.items()}
         work, read = partial(_part, folder, key), partial(_checked, folder, key)
         with Study(folder, KIND, settings) as study, pool_of(engine, workers) as pool:
-            how: dict[str, Any] = {"pool": pool, "progress": progress}
-            found = dict(study.map(cells, work, read=read, write=_written, **how))
+            how: dict[str, Any] = {"read": read, "write": lambda one: json.dumps(one).encode()}
+            found = dict(study.map(cells, work, pool=pool, progress=progress, **how))
         return {name: found[f"{name}.json"] for name in parts}
 
     @typed
@@ -237,14 +237,10 @@ class Suite:
             trivial = {f"trivial {n}": s for n, s in recipe.get("trivial", {}).items()}
             for number, i in enumerate(_ids(name, recipe)):
                 (_, sure), score = given.get(i, (None, None)), graded.get(i)
-                row = {
-                    "kind": recipe["kind"],
-                    "level": _level(recipe, number),
-                    "answered": i in given,
-                }
-                row |= {"score": score or 0.0, "refused": i in given and score is None}
+                row = {"kind": recipe["kind"], "level": _level(recipe, number), **trivial}
+                row |= {"answered": i in given, "refused": i in given and score is None}
                 row["brier"] = None if sure is None or score is None else brier(sure, score)
-                rows.append({**row, **trivial})
+                rows.append({**row, "score": score or 0.0})
         return _summary(pandas.DataFrame(rows))
 
     @property
@@ -307,10 +303,6 @@ def _file(name: str, recipe: Mapping[str, Any]) -> str:
 def _sha256(frame: pandas.DataFrame) -> str:
     """Return the SHA-256 of a table as CSV, whose numbers have all their digits."""
     return hashlib.sha256(frame.to_csv(index=False).encode()).hexdigest()
-
-
-def _written(found: Mapping[str, Any]) -> bytes:
-    return json.dumps(found).encode()
 
 
 def _checked(folder: Location | None, key: str | None, data: bytes) -> dict[str, Any]:
@@ -473,10 +465,9 @@ def _graded(
             if "source" in recipe:
                 score: float | None = _overlap(answer, about)
             else:
-                number = int(i.rpartition("-")[2])
+                number, secret = int(i.rpartition("-")[2]), key if recipe.get("private") else None
                 found = {"seed": about["seeds"][number], "draw": about["draws"][number]}
-                spec = {**specs[number], **found}
-                score = Question.of(spec, key if recipe.get("private") else None).grade(answer)
+                score = Question.of({**specs[number], **found}, secret).grade(answer)
         except ScmWorldError:
             score = None
         graded.append((i, score))

@@ -46,6 +46,8 @@ class LabVariable:
         low: Lower end of the values that may be set.
         high: Upper end.
         factor: What is set, over the value that is asked for.
+        aim: What a randomised experiment follows, drawn between the ends once in an episode; None
+            if what is set stays by itself as it was drawn.
     """
 
     name: str
@@ -56,6 +58,7 @@ class LabVariable:
     low: float = 0.0
     high: float = 0.0
     factor: float = 1.0
+    aim: str | None = None
 
 
 @final
@@ -228,6 +231,7 @@ def servos(rng: np.random.Generator, knobs: Knobs) -> Testbed:
                 float(box.low),
                 float(box.high),
                 float(held.function.weights[0]),
+                f"{command.partition('.')[0]}.hold",
             )
         )
     short = {arm: arm.partition(".")[0] for arm in made.arms.values()}

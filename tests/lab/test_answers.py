@@ -143,6 +143,18 @@ def test_edges_of_equations_are_those_of_their_weights() -> None:
         assert pair in asked.answer["hidden"]
 
 
+def test_a_randomised_arm_stays_where_it_was_drawn_and_others_follow() -> None:
+    """A pair of numbers is drawn once in an episode, although commands act in each step."""
+    (asked,) = drawn("graph", "servo", 1)
+    cause, effect = asked.answer["edges"][0]
+    others = {name: 0.0 for name in asked.view.quantities if name not in (cause, effect)}
+    seen = asked.view.run({cause: [-0.3, 0.2], **others}, 20)
+    assert -0.32 < seen[cause].min() < -0.15 < 0.05 < seen[cause].max() < 0.22
+    one, other = (asked.view.means({cause: v, **others})[effect] for v in (-0.3, 0.2))
+    slope = np.polyfit(seen[cause], seen[effect], 1)[0]
+    assert slope == pytest.approx((other - one) / 0.5, abs=0.35)
+
+
 def simulated(asked: lab.Question, values: Mapping[str, float]) -> dict[str, float]:
     """Return the readings of springs, by a loop over steps of MuJoCo."""
     k = np.random.default_rng([asked.view.entropy, 0]).uniform(0.7, 1.4, 3)

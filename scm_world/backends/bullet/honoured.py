@@ -172,8 +172,8 @@ FORCES = (
 LIVE = (*FORCES, "opt.gravity", "opt.timestep", "body_mass", "body_inertia", "pair_solref")
 """What bodies that are there take on."""
 REBUILT = (
-    "body_pos", "body_quat", "body_ipos", "jnt_pos", "jnt_axis", "qpos0", "geom_pos", "geom_quat",
-    "geom_size",
+    "body_pos", "body_quat", "body_ipos", "body_iquat", "jnt_pos", "jnt_axis", "qpos0", "geom_pos",
+    "geom_quat", "geom_size",
 )  # fmt: skip
 """What only new bodies take on."""
 

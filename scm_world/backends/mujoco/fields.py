@@ -300,6 +300,11 @@ def _body(e: Element) -> Rows:
     yield e.row("center_of_mass", "m", "Center of mass in the frame of the body.", "body_ipos",
         constant=True, usual=False, acts=heavy and not e["simple"],
         reason=f"{_SIMPLE}, unless it has no mass")
+    yield e.row("principal_axes", "1",
+        "Orientation of the principal axes of inertia in the frame of the body.", "body_iquat",
+        form=turn, kind="rotation", constant=True, low=-1.0, high=1.0, usual=False,
+        acts=heavy and e["inertia"].all() and turns and not e["simple"],
+        reason=f"{_SIMPLE}, unless it never turns or has no inertia")
     yield e.row("gravcomp", "1", "Share of the weight of the body that is held up.",
         "body_gravcomp", constant=True, usual=moves and e["gravcomp"], off="gravity", acts=heavy,
         reason=weightless)
