@@ -537,7 +537,7 @@ def laboratories() -> Any:
     lines, labels = axes[0].get_legend_handles_labels()
     for axis in axes[len(names) :]:
         axis.axis("off")
-        axis.legend(lines, labels, loc="center")
+    axes[len(names)].legend(lines, labels, loc="center")
     figure.supxlabel("budget, in that of the question")
     figure.supylabel("score, with 95 % intervals over questions")
     return figure
@@ -556,6 +556,7 @@ PICTURES: Mapping[str, Callable[[], Any]] = {
     "causes": causes,
     "randomisation": randomisation,
     "real": real,
+    "lab": laboratories,
 }
 
 

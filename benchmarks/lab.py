@@ -8,7 +8,7 @@
     python -m benchmarks.lab answers --n 200   # of questions that need not be certified; as truth
     python -m benchmarks.lab names --n 40      # guesses by names, of seeds of each world
     python -m benchmarks.lab suites --made DIR # the manifests, with the hashes of made folders
-    python -m benchmarks.lab curves            # scores of agents by budget; ten minutes, resumable
+    python -m benchmarks.lab curves            # scores of agents by budget; resumable
     python -m benchmarks.lab trained           # PPO on experiments, beside two simple agents
 
 The figures are in ``lab.json``. Questions are those of ``lab-1``, in the order of its parts.
@@ -36,7 +36,7 @@ from benchmarks.lab_truth import confirm
 from scm_world import lab
 from scm_world.discovery.data import load
 from scm_world.discovery.learners.registry import learn
-from scm_world.evaluation.statistics import mean_interval
+from scm_world.evaluation.statistics import Interval, mean_interval
 from scm_world.lab import suites
 from scm_world.lab.questions import Question, Unusable, build
 from scm_world.runs.pool import Pool
@@ -227,8 +227,8 @@ def names(n: int) -> dict[str, Any]:
 # --- agents ---------------------------------------------------------------------------------------
 
 SHARES = (0.25, 0.5, 1.0, 2.0)
-EACH = 3
-"""Questions of each kind and level."""
+EACH = 1
+"""Questions of each kind and level; with more, the same file is continued."""
 
 
 def budgeted(question: Question, share: float) -> Question:
@@ -254,16 +254,17 @@ def curved(job: dict[str, Any]) -> dict[str, Any]:
 
 
 def curves(out: Path, workers: int) -> dict[str, Any]:
-    """Play questions of ``lab-1`` that are not of servos; continue with the same file.
+    """Play questions of ``lab-1`` but of servos and rows of boxes; continue with the same file.
 
     Levels begin one after another in the list of worlds, so that all worlds have their turn. The
-    first three are left out: the agents were written with some of them.
+    first ones are left out: the agents were written with some of them.
     """
-    wanted = list[dict[str, Any]]()
+    parts = list[list[dict[str, Any]]]()
     for number, level in enumerate(lab.LEVELS, 1):
         for kind in lab.KINDS:
-            every = suites._specs(recipes()[f"{kind}-{level}"])[EACH * number :]
-            wanted += [job for job in every if job["world"] != "servo"][:EACH]
+            every = suites._specs(recipes()[f"{kind}-{level}"])[3 * number :]
+            parts.append([job for job in every if job["world"] not in ("servo", "row")][:EACH])
+    wanted = [part[i] for i in range(EACH) for part in parts]
     rows = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
     known = [{name: row[name] for name in wanted[0]} for row in rows]
     with Pool("process" if workers > 1 else None, workers) as pool, out.open("a") as file:
@@ -274,13 +275,17 @@ def curves(out: Path, workers: int) -> dict[str, Any]:
     return averaged([row for row in rows if {n: row[n] for n in wanted[0]} in wanted])
 
 
+def _row(one: Interval) -> dict[str, float]:
+    return {"value": round(one.value, 4), "low": round(one.low, 4), "high": round(one.high, 4)}
+
+
 def averaged(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Return mean scores with intervals over questions: by kind, by level, and of all."""
     good = [row for row in rows if "scores" in row]
 
     def means(values: Any, **more: Any) -> list[dict[str, float]]:
         each = [mean_interval(column, **more) for column in np.transpose(values)]
-        return [{"value": o.value, "low": o.low, "high": o.high} for o in each]
+        return [_row(one) for one in each]
 
     found: dict[str, Any] = {"shares": SHARES, "seeds without a question": len(rows) - len(good)}
     for name in (*lab.KINDS, *lab.LEVELS, "all"):
@@ -309,7 +314,7 @@ def trained(steps: int) -> dict[str, Any]:
         for name in ("random", "information")
     }
     every = {name: mean_interval(one, proportion=True) for name, one in found.items()} | minus
-    rows = {name: {"value": o.value, "low": o.low, "high": o.high} for name, o in every.items()}
+    rows = {name: _row(one) for name, one in every.items()}
     return {"steps": steps, "CPU seconds": round(time.process_time() - begin), **rows}
 
 
@@ -464,7 +469,7 @@ def main() -> None:
     parser.add_argument("--n", type=int, default=25)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--rows", type=Path)
-    parser.add_argument("--steps", type=int, default=60_000)
+    parser.add_argument("--steps", type=int, default=40_000)
     parser.add_argument("--made", type=Path, nargs="*", default=[])
     given = parser.parse_args()
     part = "curves" if given.part == "curves" else "questions"

@@ -1,6 +1,6 @@
 """Agents that choose experiments: at random, by information, and trained.
 
-``python examples/lab_agents.py 60000`` trains one with PPO (extra ``train``). All agents have the
+``python examples/lab_agents.py 40000`` trains one with PPO (extra ``train``). All agents have the
 same six experiments with ten episodes each, and the same estimator answers for them. The questions
 of the training have other seeds than those of the comparison.
 """
@@ -19,6 +19,8 @@ from scm_world.lab.environment import HIGH, LOW, LabEnv
 
 SETTING: dict[str, Any] = {"kind": "effect", "experiments": 6, "n": 10}
 TRAINED_ON = range(1000, 1064)
+PPO_SETTING: dict[str, Any] = {"ent_coef": 0.01, "gamma": 1.0, "n_steps": 1536, "batch_size": 256}
+PPO_SETTING |= {"learning_rate": 1e-3}
 
 
 def opened(seeds: range) -> LabEnv:
@@ -63,7 +65,7 @@ def compare(steps: int = 0, n: int = 40) -> dict[str, list[float]]:
     if steps:
         from stable_baselines3 import PPO
 
-        model = PPO("MlpPolicy", opened(TRAINED_ON), seed=0, device="cpu", ent_coef=0.01)
+        model = PPO("MlpPolicy", opened(TRAINED_ON), seed=0, device="cpu", **PPO_SETTING)
         model.learn(steps)
         agents["trained"] = lambda seen: model.predict(seen, deterministic=True)[0]
     return {name: scores(env, agent) for name, agent in agents.items()}

@@ -522,7 +522,7 @@ def _next(design: str, seen: _Seen, n: int) -> dict[str, Any]:
             ends = [query["outcome"]] if "outcome" in query else seen.outcomes
             found = {c for end in ends if end in graph for c in nx.ancestors(graph, end)}
             every = [(name,) for name in names if name in found] or every
-        case "information" if turn:
+        case "information" if seen.rows[seen.outcomes[0]].size:  # selection may leave no row
             return _informative(seen, n)
     return {name: seen.known.ends[name] for name in every[turn % len(every)]}
 

@@ -185,6 +185,20 @@ def test_agents_need_the_tools_only(agent: str, kind: str) -> None:
     assert room.remaining == 0
 
 
+@pytest.mark.parametrize("agent", DESIGNS)
+def test_agents_answer_where_selection_keeps_no_observation(agent: str) -> None:
+    """The first experiment of a small budget may have no row."""
+
+    class Blind(Tools):
+        def observe(self, n: int) -> dict[str, Any]:
+            found = self._room.observe(n)
+            return {**found, "columns": {name: [] for name in found["columns"]}}
+
+    room = lab.Laboratory(build("effect", "springs", 1, "L2", lab.Knobs(), 0, None))
+    lab.AGENTS[agent](Blind(room))  # type: ignore[arg-type]
+    assert room.finished
+
+
 def test_the_information_that_a_question_asks_for_is_about_its_cause() -> None:
     """Greedy information sets the cause much more often than chance, and then in one experiment."""
     asked = build("effect", "equations", 3, "L2", lab.Knobs(), 0, None)
