@@ -14,7 +14,7 @@ from scm_world._types import Floats
 from scm_world.fit.fitting import arguments_of, described
 from scm_world.fit.problem import STEP, FitProblem, Search
 from scm_world.fit.recordings import Begins, Noise, Reading, Recording
-from scm_world.fit.result import MISFIT, Fit
+from scm_world.fit.result import MISFIT, Fit, away
 from scm_world.fit.search import SAME, TRUST, Minima, Result, bounded, gauss_newton
 from scm_world.fit.shooting import Shooting
 from scm_world.fit.targets import numbers_of
@@ -115,7 +115,7 @@ class Deviation:
                 fit = self.fits[names]
                 number, value, default, size = "", np.nan, 0.0, fit.squares
                 if names:
-                    most = int((np.abs(fit.away(0.0 * fit.scaled)) / fit.errors).argmax())
+                    most = int((np.abs(away(fit, 0.0 * fit.scaled)) / fit.errors).argmax())
                     target = fit.targets[most]
                     number, value, default = target.name, fit.values[target.name], target.default
             else:

@@ -37,7 +37,7 @@ from scm_world.fit.recordings import (
     begun,
     read_recording,
 )
-from scm_world.fit.result import CONFIDENCE, DETERMINED, Fit
+from scm_world.fit.result import CONFIDENCE, DETERMINED, Fit, away
 from scm_world.fit.search import SAME, TINY, Minima, Result, gauss_newton
 from scm_world.fit.shooting import Shooting
 from scm_world.fit.targets import Target, acting, blocks_of, targets_of, twin_of
@@ -200,9 +200,9 @@ def fitted(minima: Minima, active: Sequence[int], first: Result | None = None) -
             break
         best = minima.descended(active, best, lower)
     for other in best.others:  # as good as the best one
-        away = found.away(other[[*active]])
+        distance = away(found, other[[*active]])
         margin = np.minimum(found.linear_reach, reach.max(axis=1))[:, None]
-        reach = np.maximum(reach, np.array([-away, away]).T + margin)
+        reach = np.maximum(reach, np.array([-distance, distance]).T + margin)
     still, each = found.still[problem.measured.cells[1]], found.sensitivities**2
     shown = each[~still].sum(axis=0) >= MOVING * each.sum(axis=0)
     if not shown.all() and _usual(minima, best, active, found, shown):
@@ -261,8 +261,8 @@ def covering(minima: Minima, found: Fit, others: Sequence[Minimum]) -> Fit:
         apart = np.abs(other.scaled - found.scaled) > APART * other.errors * found.discount**0.5
         for _, own in blocks_of(found.targets):
             apart[own] = apart[own].any()
-        away = found.away(other.scaled)
-        reach = np.maximum(reach, np.array([-away, away]).T * apart[:, None])
+        distance = away(found, other.scaled)
+        reach = np.maximum(reach, np.array([-distance, distance]).T * apart[:, None])
     return dataclasses.replace(found, reach=reach)
 
 

@@ -354,13 +354,6 @@ class Fit:
         inner = np.array([target.block is not None for target in self.targets], bool)
         return np.where(inner & (shares > SHARE), np.inf, found)
 
-    def away(self, other: Floats) -> Floats:
-        """Return how far other scaled numbers are away, in the numbers that are told, (p,)."""
-        found = other - self.scaled
-        for block, own in blocks_of(self.targets):
-            found[own] = block.numbers(other[own]) - block.numbers(self.scaled[own])
-        return found / self.units
-
     @cached_property
     def table(self) -> pd.DataFrame:
         """The fitted parameters.
@@ -1001,3 +994,11 @@ class Fit:
             left.set(title=column.name, ylabel=column.unit, xlabel="time [s]")
             right.set(title="residual", ylabel="standard deviations", xlabel="time [s]")
         return figure
+
+
+def away(fit: Fit, other: Floats) -> Floats:
+    """Return how far other scaled numbers are from those of a fit, in the numbers told, (p,)."""
+    found = other - fit.scaled
+    for block, own in blocks_of(fit.targets):
+        found[own] = block.numbers(other[own]) - block.numbers(fit.scaled[own])
+    return found / fit.units

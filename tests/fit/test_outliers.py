@@ -13,6 +13,7 @@ import scm_world as sw
 
 PENDULUM = """
 <mujoco model="pendulum">
+  <option timestep="0.005"/>
   <worldbody>
     <body name="pole">
       <joint name="hinge" axis="0 1 0" damping="0.01"/>
@@ -34,7 +35,7 @@ def swung(damping: float = 0.02, steps: int = 120) -> dict[str, Any]:
     commands, seen = np.repeat(rng.uniform(-0.03, 0.03, steps // 10), 10), [(0.0, 0.0)]
     for command in commands:
         data.ctrl[0] = command
-        mujoco.mj_step(model, data, 10)
+        mujoco.mj_step(model, data, 4)
         seen.append((float(data.qpos[0]), float(data.qvel[0])))
     position, velocity = (np.array(seen) + NOISE * rng.normal(size=(steps + 1, 2))).T
     names = ("time", "motor.control", "hinge.position", "hinge.velocity")

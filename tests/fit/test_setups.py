@@ -17,6 +17,7 @@ from scm_world.errors import InterventionError, ModelError, UnknownOption, Unkno
 
 PENDULUM = """
 <mujoco model="pendulum">
+  <option timestep="0.005"/>
   <worldbody>
     <body name="weight">
       <joint name="hinge" axis="0 1 0" damping="0.04" armature="0"/>
@@ -40,7 +41,7 @@ def swung(mass: float, seed: int) -> dict[str, Any]:
     commands, seen = np.repeat(rng.uniform(-2.0, 2.0, 6), 10), [0.0]
     for command in commands:
         data.ctrl[0] = command
-        mujoco.mj_step(model, data, 10)
+        mujoco.mj_step(model, data, 4)
         seen.append(float(data.qpos[0]))
     return {
         "time": 0.02 * np.arange(61),
