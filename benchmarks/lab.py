@@ -72,6 +72,8 @@ def recipes() -> dict[str, dict[str, Any]]:
                 "worlds": [*lab.offers(kind)],
                 "knobs": [*KNOBS][: 1 if kind == "graph" else None],
             }
+            if kind in ("effect", "law"):  # cubic equations have tails too heavy for means
+                recipe["knobs"][1] = {"law": "dead zone"}
             recipe |= {"seed": seed, "n": PER_PART}
             recipe |= {"private": True} if level is None else {"level": level}
             found[f"{kind}-{level or 'private'}"] = recipe
