@@ -343,7 +343,7 @@ def whole(folder: Path, n: int) -> dict[str, Any]:
     for kind, known in found.items():
         known["trivial"] = {n: round(float(np.mean(s)), 3) for n, s in known["trivial"].items()}
         if kind in answers:
-            known.update(named(answers[kind]))
+            known["names at L1 and L2"] = named(answers[kind])
     picked = np.random.default_rng(0).permutation(len(rows))[:n]
     for kind, said in confirmed([Question.of(rows[i]) for i in picked]).items():
         found[kind].update(said)
