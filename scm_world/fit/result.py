@@ -362,9 +362,9 @@ class Fit:
         ``deviation`` (value : default - 1; NaN if the default is zero), ``unit``, and whether the
         parameter is ``determined``: the width of its interval is at most its value or its scale
         (that of a positive parameter, a factor of e; that of an inertial one, see
-        ``Inertial.units``), or the interval begins at the end of the range and is below the
-        default: at most this. ``low`` and ``high`` are NaN where there is no interval: where it
-        would be the whole range.
+        ``Inertial.units``), or, where the fit explains the recording, the interval begins at the
+        end of the range and is below the default: at most this. ``low`` and ``high`` are NaN where
+        there is no interval: where it would be the whole range.
         """
         import pandas as pd
 
@@ -382,7 +382,7 @@ class Fit:
             else:
                 low, high = sorted((float(low), float(high)))
                 width, most = (high - low) / target.scale, max(abs(value) / target.scale, 1.0)
-            at_most = open_ends[0] and high <= target.default
+            at_most = open_ends[0] and high <= target.default and self.explains
             determined = bool((width <= most or at_most) and not unsure)
             if target.block is not None:
                 low, high = value - down * self.units[i], value + up * self.units[i]
