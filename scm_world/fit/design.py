@@ -132,7 +132,7 @@ def suggested(
 ) -> tuple[Experiment, ...]:
     """Choose experiments after which the parameters have the least variance; see ``Fit.suggest``.
 
-    ``known`` are the sensitivities of the recording to the numbers that are told, shape (m, p).
+    ``known`` are the sensitivities of the recording to the numbers that are reported, shape (m, p).
 
     Source:
         Chaloner and Verdinelli, *Bayesian experimental design: a review*, Statistical Science

@@ -249,7 +249,7 @@ def covering(minima: Minima, found: Fit, others: Sequence[Minimum]) -> Fit:
     if windows > 1:
         scores = np.array([along.T @ left for left, along in (w.projected for w in found.found)])
         sums = np.array([scores[one].sum(axis=0) for one in blocks]) @ found.into
-        within = sums @ spread_of(found.told)
+        within = sums @ spread_of(found.reported)
         errors = np.sqrt((within**2).sum(axis=0) * len(blocks) / (len(blocks) - 1))
         far = stdtrit(len(blocks) - 1, 0.5 + 0.5 * CONFIDENCE) * errors
         reach = np.maximum(reach, far[:, None])
@@ -285,7 +285,7 @@ def _profile(
     exceed those of the fit by as much as linearised ones do at the end of a linearised interval. It
     is infinite where they do not, up to the end of the range. Where impacts make the residuals
     rough, it is not less than the linearised one; that of parameters which cannot be distinguished
-    is the linearised one, and so is that of an inertia, which is told in other numbers.
+    is the linearised one, and so is that of an inertia, which is reported in other numbers.
 
     Source:
         Bates and Watts, *Nonlinear Regression Analysis and Its Applications*, 1988, chapter 6.

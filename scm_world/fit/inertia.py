@@ -74,7 +74,7 @@ def _factor(matrix: Floats) -> Floats:
 
 @final
 @dataclass(frozen=True, eq=False)
-class Inertial:
+class InertiaBlock:
     """The mass, the center of mass and the inertia of a body, as a search moves them.
 
     The searched numbers are those of the factor U of the pseudo-inertia matrix U Uᵀ, with a
@@ -102,7 +102,7 @@ class Inertial:
     root: Floats
 
     @classmethod
-    def of(cls, name: str, values: Mapping[str, ArrayLike]) -> Inertial:
+    def of(cls, name: str, values: Mapping[str, ArrayLike]) -> InertiaBlock:
         """Return the block of a body with these values of its ``PARTS``.
 
         Raises:

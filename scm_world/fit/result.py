@@ -102,7 +102,7 @@ class Fit:
         found: The windows, linearised at the fit.
         spans: Size of a scaled unit of each free number of a start state, shape (k,).
         reach: How far the intervals reach down and up, scaled, those of an inertia in the numbers
-            that are told, shape (p, 2); None if linearised.
+            that are reported, shape (p, 2); None if linearised.
         shortened: Whether the windows are shorter than usual because segments did not join.
         ended: Whether the search took all its steps before it found a minimum.
         interrupted: Whether Ctrl-C ended the search; intervals are linearised, none is determined.
@@ -284,12 +284,12 @@ class Fit:
 
     @cached_property
     def covariance(self) -> Floats:
-        """Covariance of the numbers that are told, shape (p, p), without undetermined directions.
+        """Covariance of the reported numbers, shape (p, p), without undetermined directions.
 
         It is that of linearised least squares, times the discount for correlated residuals. Of an
         inertia some directions always are undetermined: the error of these is that of the prior.
         """
-        sizes, directions = self._directions(self.told)
+        sizes, directions = self._directions(self.reported)
         errors = np.sqrt(self.discount) / np.maximum(sizes, 1e-12)
         errors[self._open(sizes)] = PRIOR
         return np.asarray((directions.T * errors**2) @ directions)
@@ -304,7 +304,7 @@ class Fit:
 
     @cached_property
     def units(self) -> Floats:
-        """Sizes of the numbers of an inertia, see ``Inertial.units``, and 1 of others, (p,)."""
+        """Sizes of the numbers of an inertia, see ``InertiaBlock.units``, and 1 of others, (p,)."""
         found = np.ones(len(self.scaled))
         for block, own in blocks_of(self.targets):
             found[own] = block.units(self.scaled[own])
@@ -312,10 +312,10 @@ class Fit:
 
     @cached_property
     def into(self) -> Floats:
-        """Derivatives of the scaled numbers by those that are told, shape (p, p).
+        """Derivatives of the scaled numbers by those that are reported, shape (p, p).
 
-        Told are the ten parameters of an inertia in ``Inertial.units``; others are as scaled. The
-        differences are those of the sensitivities, so that both have one error.
+        Reported are the ten parameters of an inertia in ``InertiaBlock.units``; others are as
+        scaled. The differences are those of the sensitivities, so that both have one error.
         """
         found = np.eye(len(self.scaled))
         for block, own in blocks_of(self.targets):
@@ -326,21 +326,21 @@ class Fit:
         return found
 
     @cached_property
-    def told(self) -> Floats:
-        """Derivatives of the residuals by the numbers that are told, shape (n, p)."""
+    def reported(self) -> Floats:
+        """Derivatives of the residuals by the numbers that are reported, shape (n, p)."""
         return np.asarray(self.sensitivities @ self.into)
 
     @property
     def errors(self) -> Floats:
-        """Standard errors of the numbers that are told, scaled, shape (p,)."""
+        """Standard errors of the numbers that are reported, scaled, shape (p,)."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
     def linear_reach(self) -> Floats:
         """How far the intervals of linearised least squares reach, scaled, shape (p,).
 
-        Those of an inertia are of the numbers that are told: motion is almost linear in these. They
-        are infinite where an undetermined combination has a share.
+        Those of an inertia are of the reported numbers: motion is almost linear in these. They are
+        infinite where an undetermined combination has a share.
 
         Source:
             Atkeson, An and Hollerbach, *Estimation of inertial parameters of manipulator loads and
@@ -349,7 +349,7 @@ class Fit:
         from scipy.special import stdtrit
 
         found = stdtrit(self.degrees, 0.5 + 0.5 * CONFIDENCE) * self.errors
-        sizes, directions = self._directions(self.told)
+        sizes, directions = self._directions(self.reported)
         shares = np.linalg.norm(directions[self._open(sizes)], axis=0)
         inner = np.array([target.block is not None for target in self.targets], bool)
         return np.where(inner & (shares > SHARE), np.inf, found)
@@ -362,9 +362,9 @@ class Fit:
         ``deviation`` (value : default - 1; NaN if the default is zero), ``unit``, and whether the
         parameter is ``determined``: the width of its interval is at most its value or its scale
         (that of a positive parameter, a factor of e; that of an inertial one, see
-        ``Inertial.units``), or, where the fit explains the recording, the interval begins at the
-        end of the range and is below the default: at most this. ``low`` and ``high`` are NaN where
-        there is no interval: where it would be the whole range.
+        ``InertiaBlock.units``), or, where the fit explains the recording, the interval begins at
+        the end of the range and is below the default: at most this. ``low`` and ``high`` are NaN
+        where there is no interval: where it would be the whole range.
         """
         import pandas as pd
 
@@ -406,13 +406,13 @@ class Fit:
         units, whether it is ``determined``, its main ``parameters``, and the ``combination`` in
         words. A scaled unit of a positive parameter is that of its logarithm: 0.1 is 10 %. That of
         another one is its value or its scale, whichever is larger; that of an inertial parameter
-        is its size in ``Inertial.units``.
+        is its size in ``InertiaBlock.units``.
         """
         import pandas as pd
 
         plain = [t.log or t.block is not None for t in self.targets]
         units = np.where(plain, 1.0, np.maximum(np.abs(self._sizes), 1.0))
-        sizes, directions = self._directions(self.told * units)
+        sizes, directions = self._directions(self.reported * units)
         rows, seen = [], ~self._open(sizes)
         for size, found, shown in zip(sizes, directions, seen, strict=True):
             error = float(np.sqrt(self.discount) / max(size, 1e-12))
@@ -866,7 +866,7 @@ class Fit:
         """
         longest = max(len(run.commands) for run in self.runs)
         count = longest if steps is None else steps
-        known = self.told / np.sqrt(self.discount)
+        known = self.reported / np.sqrt(self.discount)
         how: dict[str, Any] = {"steps": count, "limits": limits, "seed": seed, "setups": setups}
         return suggested(self, known, n, **how)
 
@@ -997,7 +997,7 @@ class Fit:
 
 
 def away(fit: Fit, other: Floats) -> Floats:
-    """Return how far other scaled numbers are from those of a fit, in the numbers told, (p,)."""
+    """Return how far other scaled numbers are from those of a fit, in the numbers reported."""
     found = other - fit.scaled
     for block, own in blocks_of(fit.targets):
         found[own] = block.numbers(other[own]) - block.numbers(fit.scaled[own])

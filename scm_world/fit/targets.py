@@ -21,7 +21,7 @@ from scm_world.fit.inertia import (
     NUMBERS,
     PARTS,
     SECOND,
-    Inertial,
+    InertiaBlock,
     swapped,
     ten_numbers,
     turn_from,
@@ -65,7 +65,7 @@ class Target:
             the two ends of a symmetric range.
         values: All numbers of the variable in the world; None for a delay, which the world lacks.
         block: The inertia of which it is one of ten numbers, one after another. It is searched in
-            the numbers of the block, and told in those of ``Inertial.numbers``.
+            the numbers of the block, and reported as those of ``InertiaBlock.numbers``.
         forms: What turns values of the variable into those of which it is a component, and back,
             where these can have any value.
     """
@@ -81,7 +81,7 @@ class Target:
     high: float
     whole: bool = False
     values: Floats | None = None
-    block: Inertial | None = None
+    block: InertiaBlock | None = None
     forms: tuple[Form, Form] = (np.asarray, np.asarray)
 
     @property
@@ -143,7 +143,7 @@ class Conditional:
         return np.asarray(self.own[0].forms[1](values.reshape((*lead, *usual.shape))))
 
 
-def _drawn(block: Inertial, at: Floats) -> tuple[list[Target], Floats]:
+def _drawn(block: InertiaBlock, at: Floats) -> tuple[list[Target], Floats]:
     """Return numbers of an inertia whose normal distribution has only bodies that can exist.
 
     They are the logarithms of the mass and of the second moments along the principal axes, the
@@ -241,14 +241,14 @@ def values_of(targets: Sequence[Target], scaled: Floats) -> dict[str, Floats]:
 
 
 def numbers_of(targets: Sequence[Target], scaled: Floats) -> Floats:
-    """Return the numbers that are told of scaled numbers, shape (p,) each."""
+    """Return the numbers that are reported of scaled numbers, shape (p,) each."""
     found = np.array([float(t.value(n)) for t, n in zip(targets, scaled, strict=True)])
     for block, own in blocks_of(targets):
         found[own] = block.numbers(scaled[own])
     return found
 
 
-def blocks_of(targets: Sequence[Target]) -> list[tuple[Inertial, slice]]:
+def blocks_of(targets: Sequence[Target]) -> list[tuple[InertiaBlock, slice]]:
     """Return the inertias among some targets, each with the places of its ten numbers."""
     firsts = ((t.block, i) for i, t in enumerate(targets) if not t.component)
     return [(block, slice(i, i + 10)) for block, i in firsts if block is not None]
@@ -403,7 +403,7 @@ def _inertials(
 
 def _ten(name: str, values: Mapping[str, ArrayLike]) -> Iterator[Target]:
     """Return the ten numbers of the inertia of a body."""
-    block = Inertial.of(name, values)
+    block = InertiaBlock.of(name, values)
     usual = block.numbers(np.zeros(10))
     for i, (label, unit) in enumerate(NUMBERS.items()):
         end = FAR if i in LOGS else math.inf

@@ -453,7 +453,8 @@ def _usual(view: LevelView) -> dict[str, float]:
 def _target(view: LevelView) -> str:
     """Return the answer that is a name; a seed draws it, before all else, from all causes alike."""
     if len(view.testbed.causes) < CAUSES:
-        raise ModelError([f"names would be guessed: there are fewer than {CAUSES} causes"])
+        said = f"names would be guessed: there are fewer than {CAUSES} causes"
+        raise ModelError([f"{said}; give a world that has more, or another kind"])
     return view.names[view.testbed.causes[int(view.lot * len(view.testbed.causes))]]
 
 

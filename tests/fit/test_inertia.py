@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import scm_world as sw
 from scm_world.errors import InterventionError, NotIntervenable
-from scm_world.fit.inertia import NUMBERS, PARTS, Inertial, ten_numbers
+from scm_world.fit.inertia import NUMBERS, PARTS, InertiaBlock, ten_numbers
 from scm_world.fit.shooting import Shooting
 
 ARM = """<mujoco><option timestep="0.005"/><worldbody>
@@ -56,7 +56,7 @@ def test_ten_numbers_are_those_of_the_points_of_a_body() -> None:
     around = np.einsum("p,pi,pj->ij", masses, points, points)
     tensor = np.trace(around) * np.eye(3) - around
     expected = [masses.sum(), *(masses @ points), *tensor[np.triu_indices(3)]]
-    block = Inertial.of("load.inertial", {part: HELD[f"load.{part}"] for part in PARTS})
+    block = InertiaBlock.of("load.inertial", {part: HELD[f"load.{part}"] for part in PARTS})
     scaled = block.searched(np.array(expected))
     assert scaled is not None
     mass, center, moments, axes = block.body(scaled)
@@ -70,7 +70,7 @@ def test_ten_numbers_are_those_of_the_points_of_a_body() -> None:
 
 def test_any_ten_numbers_are_a_body() -> None:
     """Masses and second moments are positive, however far a search goes; zero is the body as is."""
-    block = Inertial.of("load.inertial", {part: HELD[f"load.{part}"] for part in PARTS})
+    block = InertiaBlock.of("load.inertial", {part: HELD[f"load.{part}"] for part in PARTS})
     for scaled in np.random.default_rng(2).normal(scale=4.0, size=(200, 10)):
         mass, _, moments, axes = block.body(scaled)
         assert mass > 0.0
