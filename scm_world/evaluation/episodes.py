@@ -376,7 +376,8 @@ def in_world(policy: object, world: World) -> Policy:
         conventions=world.options.conventions.name,
         **options,
     )
-    remembers = agent.card is not None and agent.card.memory > 0
+    history = env.history
+    remembers = history is not None or (agent.card is not None and agent.card.memory > 0)
     last = (-1, -1, -1)
 
     def act(now: World) -> Floats:
@@ -388,7 +389,12 @@ def in_world(policy: object, world: World) -> Policy:
             raise ActionError(f"{problem}; make one for each branch, and begin at step 0", None)
         if now.index == 0 or present[:2] != last[:2]:
             agent.start(env)
+            if history is not None:
+                history.rows[:] = 0.0
         last = present
-        return env.actions.command(agent.act(env.observe()))
+        action = agent.act(env.observe())
+        if history is not None:
+            history.push(np.zeros(1, int), env.actions.in_space(np.ravel(action)))
+        return env.actions.command(action)
 
     return act
