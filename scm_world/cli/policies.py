@@ -87,8 +87,8 @@ def train(
     Example: scm-world train reaching --set n_steps=128 --out my-reacher
 
     Args:
-        algo: ppo, sac or td3 of Stable-Baselines3, or rsl_ppo of rsl-rl; by default ppo, on an
-            engine that steps thousands of worlds together rsl_ppo.
+        algo: ppo, sac or td3 of Stable-Baselines3, recurrent_ppo of sb3-contrib, or rsl_ppo of
+            rsl-rl; by default ppo, on an engine that steps thousands of worlds together rsl_ppo.
         curriculum: Variation: 0 for none, 1 for goals, 2 for everything (gravity and gains, too),
             a protocol such as P10, or the JSON file of a curriculum; by default the tuned one.
         recipe: JSON file of a recipe; by default the one tuned for the task.
