@@ -355,7 +355,7 @@ def in_world(policy: object, world: World) -> Policy:
     Raises:
         UnknownOption: The policy is unknown, or was trained with other options.
         SnapshotMismatch: When it acts: that world has another task or other options.
-        ActionError: When it acts: it has a memory, and this is not the control step after the last
+        ActionError: When it acts: it has a memory or observes a history, and this is not the control step after the last
             one, as in a branch of an episode.
 
     Example:
@@ -377,7 +377,7 @@ def in_world(policy: object, world: World) -> Policy:
         **options,
     )
     history = env.history
-    remembers = history is not None or (agent.card is not None and agent.card.memory > 0)
+    remembers = agent.remembers or history is not None
     last = (-1, -1, -1)
 
     def act(now: World) -> Floats:

@@ -105,6 +105,7 @@ class Agent:
         begin: Returns the actor of the episode that an environment has begun.
         policy: What ``as_agent`` was given.
         card: What the policy was trained for, if known.
+        remembers: Whether its actions follow from earlier control steps of the episode, too.
     """
 
     @typed
@@ -114,9 +115,11 @@ class Agent:
         begin: Callable[[PolicyEnv], Actor],
         policy: object = None,
         card: PolicyAbout | None = None,
+        *,
+        remembers: bool = False,
     ) -> None:
         self.about: About = dict(about)
-        self.policy, self.card = policy, card
+        self.policy, self.card, self.remembers = policy, card, remembers
         self._begin = begin
         self._env: PolicyEnv | None = None
         self._act: Actor | None = None
@@ -236,7 +239,7 @@ def _network(policy: MlpPolicy, name: str, env: PolicyEnv) -> Actor:
     if policy.made_for is not None:
         policy.made_for.check(env, name)
     policy.check(env.observe(), env.world.compiled.n_actions)
-    return _model(policy, env) if policy.about.memory else policy
+    return _model(policy, env) if policy.n_remembered else policy
 
 
 def _of_world(given: str | Policy, name: str, env: PolicyEnv) -> Actor:
@@ -344,7 +347,7 @@ def _of_text(text: str, trusted: SequenceOf[str] | None) -> Agent:
     about["sha256"] = _sha256(path, "give the path of a policy")
     found = load_policy(path) if path.suffix == ".safetensors" else _archived(path, trusted or ())
     if isinstance(found, MlpPolicy):
-        return Agent(about, partial(_network, found, about["name"]), text, found.made_for)
+        return _of_network(found, about, text)
     return Agent({**about, **_library(SB3)}, partial(_model, found), text)
 
 
@@ -388,8 +391,7 @@ def _of_object(policy: Any, about: About) -> Agent:
         begin = partial(_of_world, inside, about["name"])
         return Agent({**about, "sees": "world"}, begin, policy)
     if isinstance(made, MlpPolicy):
-        about = {**about, "sha256": made.sha256}
-        return Agent(about, partial(_network, made, about["name"]), policy, made.made_for)
+        return _of_network(made, {**about, "sha256": made.sha256}, policy)
     if not hasattr(made, "predict"):
         return Agent(about, partial(_function, made), policy)
     try:
@@ -397,6 +399,11 @@ def _of_object(policy: Any, about: About) -> Agent:
     except (AttributeError, UnknownOption):  # it has no environment of this package any more
         return Agent(about, partial(_model, made), policy)
     return Agent(about, partial(_model, made, seen=seen_through(made.get_env())), policy, card)
+
+
+def _of_network(network: MlpPolicy, about: About, policy: object) -> Agent:
+    begin, remembers = partial(_network, network, about["name"]), network.n_remembered > 0
+    return Agent(about, begin, policy, network.made_for, remembers=remembers)
 
 
 def _description(policy: object) -> About:
