@@ -355,8 +355,8 @@ def in_world(policy: object, world: World) -> Policy:
     Raises:
         UnknownOption: The policy is unknown, or was trained with other options.
         SnapshotMismatch: When it acts: that world has another task or other options.
-        ActionError: When it acts: it has a memory or observes a history, and this is not the control step after the last
-            one, as in a branch of an episode.
+        ActionError: When it acts: it has a memory or observes a history, and this is not the
+            control step after the last one, as in a branch of an episode.
 
     Example:
         >>> from scm_world.queries import World
