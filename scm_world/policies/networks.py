@@ -35,7 +35,7 @@ import numpy as np
 import safetensors.numpy
 from numpy.typing import NDArray
 
-from scm_world._arguments import true_or_false, typed
+from scm_world._arguments import true_or_false, typed, whole_number
 from scm_world._types import ArrayLike, Floats
 from scm_world.errors import ActionError, ModelError, UnknownOption, reading
 from scm_world.geometry.numbers import njit
@@ -160,11 +160,46 @@ class MlpPolicy:
             raise UnknownOption("policy", self, ("one with a value network",))
         return self._computed(self.value, self.joined(observation))
 
-    def _computed(self, layers: tuple[Layer, ...], seen: NDArray[Any]) -> Floats:
+    def hidden(self, observation: Observed, state: ArrayLike | None = None) -> Floats:
+        """Compute the activations of the last hidden layer, shape (..., k).
+
+        A policy without hidden layers has the input of its only layer instead.
+
+        Args:
+            observation: As above.
+            state: The memory before this observation, as in ``predict``; None: it is empty.
+
+        Raises:
+            ActionError: As above.
+        """
+        seen = self.joined(observation)
+        if self.about.memory:
+            shape = (*seen.shape[:-1], self.about.memory)
+            kept = np.zeros(shape) if state is None else np.reshape(state, shape)
+            seen = np.concatenate([seen, kept], axis=-1)
+        return self._computed(self.layers, seen, stop=-1)
+
+    def untrained(self, seed: int = 0) -> MlpPolicy:
+        """Return a policy of equal shapes and metadata whose weights are random.
+
+        A weight is normal, with the standard deviation ``1 / sqrt(inputs)``; a bias is 0.
+        """
+        rng = np.random.default_rng(whole_number("seed", seed, least=0))
+        tensors = {
+            name: np.zeros_like(tensor)
+            if tensor.ndim == 1
+            else (rng.normal(size=tensor.shape) / math.sqrt(tensor.shape[1])).astype(np.float32)
+            for name, tensor in self.tensors().items()
+        }
+        return self.of(tensors, self.made_for)
+
+    def _computed(
+        self, layers: tuple[Layer, ...], seen: NDArray[Any], stop: int | None = None
+    ) -> Floats:
         x = np.ascontiguousarray(seen.reshape(-1, len(layers[0].weight)), dtype=np.float64)
         doubles = self._doubles[layers is self.value]
         hidden = 1 if self.about.activation == "tanh" else 2
-        for number, (weight, bias) in enumerate(doubles, start=1):
+        for number, (weight, bias) in enumerate(doubles[:stop], start=1):
             x = _dense(x, weight, bias, hidden if number < len(layers) else 0)
         return x.reshape(*seen.shape[:-1], x.shape[1])
 
