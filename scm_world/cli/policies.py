@@ -87,8 +87,8 @@ def train(
     Example: scm-world train reaching --set n_steps=128 --out my-reacher
 
     Args:
-        algo: ppo, sac or td3 of Stable-Baselines3, or rsl_ppo of rsl-rl; by default ppo, on an
-            engine that steps thousands of worlds together rsl_ppo.
+        algo: ppo, sac or td3 of Stable-Baselines3, recurrent_ppo of sb3-contrib, or rsl_ppo of
+            rsl-rl; by default ppo, on an engine that steps thousands of worlds together rsl_ppo.
         curriculum: Variation: 0 for none, 1 for goals, 2 for everything (gravity and gains, too),
             a protocol such as P10, or the JSON file of a curriculum; by default the tuned one.
         recipe: JSON file of a recipe; by default the one tuned for the task.
@@ -330,10 +330,10 @@ def explain(
         one_of(name, given, (*known, None) if len(known) == 1 else known)
     metric = found.metric(metric)
     chosen = {"agent": agent or found.agents[0], "engine": backend or found.engines[0]}
-    known = None if inferred is None else Inferred.load(inferred)
+    judged = None if inferred is None else Inferred.load(inferred)
     if episode is None:
         for name in found.protocols if protocol is None else (protocol,):
-            causes = found.causes(name, metric, **chosen, inferred=known)
+            causes = found.causes(name, metric, **chosen, inferred=judged)
             score = found.score(name, metric, **chosen)
             about = f"{chosen['agent']} on {chosen['engine']}, {metric.replace('_', ' ')} {score}"
             console.say(f"{name}: {about}", str(causes) or "nothing is varied in it", "")
@@ -345,7 +345,7 @@ def explain(
         reasons = why(found.only(**chosen), protocol, episode, **how, progress=tell)
     title = f"{protocol}, episode {episode}: {metric.replace('_', ' ')} {reasons.score:.3g}"
     matter = [one.variable for one in reasons.others if one.gain]
-    console.say(title, reasons, *missing({} if known is None else known.verdicts(), matter))
+    console.say(title, reasons, *missing({} if judged is None else judged.verdicts(), matter))
 
 
 def infer(

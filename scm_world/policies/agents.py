@@ -283,7 +283,7 @@ def _network(policy: MlpPolicy, name: str, env: PolicyEnv) -> Actor:
     if policy.made_for is not None:
         policy.made_for.check(env, name)
     policy.check(env.observe(), env.world.compiled.n_actions)
-    return _model(policy, env) if policy.about.memory else policy
+    return _model(policy, env) if policy.n_remembered else policy
 
 
 def _of_world(given: str | Policy, name: str, env: PolicyEnv) -> Actor:

@@ -13,7 +13,7 @@ from typing import Any, final
 import gymnasium
 import numpy as np
 
-from scm_world._arguments import missing
+from scm_world._arguments import load, missing
 from scm_world._types import Floats
 from scm_world.env.observer import FAILED
 from scm_world.errors import (
@@ -30,7 +30,7 @@ from scm_world.training.export import begin_with, exported
 from scm_world.training.recipe import Recipe
 from scm_world.training.rounds import Rounds, restore_last
 from scm_world.training.sb3 import Sb3VecEnv
-from scm_world.training.settings import Rate
+from scm_world.training.settings import Ppo, Rate
 from scm_world.training.worlds import SEEDS, SUCCESS, make_envs, scales
 
 try:
@@ -115,13 +115,18 @@ class Scaled(BaseFeaturesExtractor):
 def make_learner(
     recipe: Recipe, worlds: Episodes, *, seed: int, device: str = "cpu"
 ) -> BaseAlgorithm:
-    """Make the algorithm of a recipe: a ``PPO``, ``SAC`` or ``TD3`` of Stable-Baselines3."""
+    """Make the algorithm of a recipe: ``PPO``, ``SAC``, … of Stable-Baselines3."""
     network, settings = recipe.network, recipe.settings.model_dump()
     policy: dict[str, Any] = {
         "net_arch": list(network.hidden),
         "activation_fn": {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}[network.activation],
     }
-    if recipe.algo == "ppo":
+    library, kind, suffix = stable_baselines3, recipe.algo.upper(), "Policy"
+    if recipe.algo == "recurrent_ppo":
+        library = load("sb3_contrib", "sb3-contrib", "train")
+        kind, suffix = "RecurrentPPO", "LstmPolicy"
+        policy["lstm_hidden_size"] = network.recurrent
+    if isinstance(recipe.settings, Ppo):
         policy |= {"log_std_init": network.log_std, "ortho_init": network.orthogonal}
     if network.scaled:
         (layout,) = worlds.get_attr("layout", 0)
@@ -142,8 +147,8 @@ def make_learner(
     if recipe.scale_rewards:
         env = VecNormalize(worlds, norm_obs=False, gamma=settings["gamma"])
     is_dict = hasattr(worlds.observation_space, "spaces")
-    model = getattr(stable_baselines3, recipe.algo.upper())(
-        "MultiInputPolicy" if is_dict else "MlpPolicy",
+    model = getattr(library, kind)(
+        ("MultiInput" if is_dict else "Mlp") + suffix,
         env,
         learning_rate=rate_of(recipe.rate),
         policy_kwargs=policy,
@@ -319,7 +324,7 @@ def _learn(model: BaseAlgorithm, watch: Watch, folder: Path) -> None:
         make_output_format("tensorboard", str(make_folder(folder / "tensorboard"))),
     ]
     model.set_logger(Logger(str(folder), outputs))
-    every = 1 if recipe.algo == "ppo" else recipe.worlds  # rounds, or episodes
+    every = 1 if isinstance(recipe.settings, Ppo) else recipe.worlds  # rounds, or episodes
     try:
         model.learn(
             recipe.steps - before, callback=watch, reset_num_timesteps=False, log_interval=every
@@ -434,7 +439,8 @@ class Watch(BaseCallback):
         """Freeze PPO's policy while only the value is learned; lower its standard deviations."""
         recipe, policy, steps = self.recipe, self.model.policy, self.model.num_timesteps
         if recipe.critic_warmup:
-            for part in (policy.mlp_extractor.policy_net, policy.action_net, policy.log_std):
+            actor = policy.mlp_extractor.policy_net, policy.action_net, policy.log_std
+            for part in (*actor, getattr(policy, "lstm_actor", policy.log_std)):
                 part.requires_grad_(steps >= recipe.critic_warmup)
         if recipe.network.log_std_end is not None:
             first, done = recipe.network.log_std, min(steps / recipe.steps, 1.0)

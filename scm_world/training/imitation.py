@@ -158,6 +158,8 @@ class Lesson(Frozen):
     def _remembers(self) -> Self:
         if self.memory and self.symmetric:
             raise UnknownOption("symmetric", True, ("False", "True with memory=False"))
+        if self.network.recurrent is not None:
+            raise UnknownOption("network.recurrent of a lesson", self.network.recurrent, ("None",))
         if self.memory and not hasattr(NAMED[self.teacher](), "memory"):
             allowed = (f"False: {self.teacher!r} does not report its memory",)
             raise UnknownOption("memory of a lesson", True, allowed)

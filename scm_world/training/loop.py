@@ -80,7 +80,8 @@ def train(
         start: Policy to begin with: a file, the folder of a run, or one of the zoo.
         progress: Called with how many steps are done, and how many there are.
         tell: Called with a sentence about each event.
-        device: ``"cpu"``, ``"cuda"``, or ``"auto"``: the GPU if there is one, but for ``"ppo"``.
+        device: ``"cpu"``, ``"cuda"``, or ``"auto"``: the GPU if there is one, but for PPO of
+            Stable-Baselines3 and sb3-contrib.
         threads: Threads of the backend and of torch. None: as many as there are cores for the
             backend, whose results do not depend on it, and one for torch, whose last bits do.
 
@@ -88,7 +89,7 @@ def train(
         Where its policies are.
 
     Raises:
-        MissingExtra: Stable-Baselines3, or rsl-rl for ``"rsl_ppo"``, is not installed.
+        MissingExtra: Stable-Baselines3, or the library of the algorithm, is not installed.
         UnknownOption: Something is asked for that does not exist.
         UnreadableFile: Another training is in the folder, or another process is writing to it.
         UnwritableFolder: The disk is full, or permission is missing.
@@ -101,6 +102,8 @@ def train(
         from scm_world.training import many as library
     else:
         load(*used)
+        if recipe.algo == "recurrent_ppo":
+            load(*(used := ("sb3_contrib", "sb3-contrib", "train")))
         from scm_world.training import algorithms as library
 
     if whole_number("seed", seed, least=0) > LARGEST_SEED:

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import zipfile
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -18,17 +19,20 @@ import pytest
 import safetensors.numpy
 
 from scm_world._arguments import missing
+from scm_world.env import ScmWorldEnv
 from scm_world.errors import (
+    ActionError,
     Diverged,
     InterventionError,
     MissingExtra,
+    ModelError,
     ScmWorldError,
     UnknownOption,
     UnreadableFile,
     UnwritableFolder,
 )
 from scm_world.evaluation import evaluate
-from scm_world.policies import load_policy, save_policy
+from scm_world.policies import MlpPolicy, as_agent, load_policy, save_policy
 from scm_world.runs.study import Study, settings_in
 from scm_world.training.export import begin_with
 from scm_world.training.loop import train
@@ -64,6 +68,15 @@ RECIPES: dict[str, Recipe] = {
         batch_size=16,
         rate={"schedule": "adaptive"},
         scale_rewards=True,
+        critic_warmup=64,
+    ),
+    "recurrent": recipe(
+        "pushing",
+        "recurrent_ppo",
+        **{**SMALL, "network": {"hidden": [8], "recurrent": 6}},
+        steps=256,
+        n_steps=8,
+        batch_size=16,
         critic_warmup=64,
     ),
     "sac": recipe("pushing", "sac", **OFF),
@@ -160,7 +173,63 @@ def test_the_same_seed_learns_the_same(tmp_path: Path) -> None:
         np.testing.assert_array_equal(array, other[key], err_msg=key)
 
 
-@pytest.mark.parametrize("name", RECIPES)
+def test_a_recurrent_policy_acts_as_its_model(tmp_path: Path) -> None:
+    """Over two episodes, with scaled observations; the file resumes, starts and has its value."""
+    made = RECIPES["recurrent"].but(**{"network.scaled": True})
+    path = run(made, tmp_path / "run").policy
+    worlds = algorithms.make_worlds(made, backend="fake")
+    model = algorithms.make_learner(made, worlds, seed=0)
+    begin_with(model, made, path)
+    worlds.close()
+    seen = np.random.default_rng(0).normal(0, 0.5, (12, 3, *model.observation_space.shape))
+    seen, policy = seen.astype(np.float32), load_policy(path)
+    mine = theirs = alone = None
+    for step, rows in enumerate(seen):
+        first = np.array([step in (0, 7), False, step == 5])
+        wanted, theirs = model.predict(rows, theirs, first, deterministic=True)
+        found, mine = policy.predict(rows, mine, first)
+        single, alone = policy.predict(rows[0], alone, first[0])
+        np.testing.assert_allclose(found, wanted, atol=1e-5)
+        np.testing.assert_array_equal(single, found[0])
+    assert np.ptp(found) > 0.01
+    assert policy.value_lstm
+    agent = as_agent(str(path))
+    with closing(ScmWorldEnv("pushing", backend="fake", **made.options)) as env:
+        played = []
+        for _ in range(2):
+            shown, _ = env.reset(seed=0)
+            agent.start(env)
+            played.append([agent.act(shown) for _ in range(3)])
+    np.testing.assert_array_equal(*played)  # emptied at the start of an episode
+    assert np.ptp(played[0], axis=0).max() > 0.0  # it remembers what it has seen
+    with pytest.raises(ActionError, match="has a memory"):
+        policy(shown)
+    for tensors in (
+        {**policy.tensors(), "lstm.1.bias": np.zeros(7, np.float32)},
+        {n: one for n, one in policy.tensors().items() if not n.startswith("lstm.1")},
+    ):
+        with pytest.raises(ModelError, match=r"lstm: expected two layers"):
+            MlpPolicy.of(tensors)
+
+
+def test_a_recurrent_training_resumes_and_repeats(tmp_path: Path) -> None:
+    """After a kill from its checkpoint; with the same seed the same bits."""
+    out, said = tmp_path / "run", list[str]()
+    killed("recurrent", out, 160)
+    assert run("recurrent", out, tell=said.append).steps == 256
+    assert said[1].startswith("goes on after")
+    one, two = (run("recurrent", tmp_path / name).policy for name in ("one", "two"))
+    for name, array in weights(one).items():
+        np.testing.assert_array_equal(array, weights(two)[name], err_msg=name)
+    given = RECIPES["recurrent"].but(**{"rate.initial": 1e-12, "rate.schedule": "constant"})
+    found = weights(run(given, tmp_path / "started", start=one).policy)
+    for name, array in weights(one).items():
+        np.testing.assert_allclose(found[name], array, atol=1e-6, err_msg=name)
+    with pytest.raises(UnknownOption, match=r"network\.recurrent with ppo"):
+        recipe("pushing", network={"recurrent": 6})
+
+
+@pytest.mark.parametrize("name", [name for name in RECIPES if name != "recurrent"])
 @pytest.mark.parametrize("scaled", [False, True])
 def test_the_policy_file_acts_as_the_model(name: str, scaled: bool, tmp_path: Path) -> None:
     """On observations of every size; scales of observations are in its weights."""
