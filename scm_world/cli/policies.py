@@ -142,7 +142,7 @@ def clone(
     workers: options.ManyWorkers = 0,
     common: Training,
 ) -> None:
-    """Train a network by imitation of a scripted policy, or of recordings.
+    """Train a network by imitation of a scripted or trained policy, or of recordings.
 
     Episodes that end well are learned from. After an interruption the same command resumes.
     'scm-world evaluate' takes the policy. 'scm-world train --start' starts from it where the recipe
@@ -151,7 +151,8 @@ def clone(
     Example: scm-world clone picking --episodes 200 --out my-picker
 
     Args:
-        from_: A policy that sees the whole world, such as feedback; a recording (.parquet), or a
+        from_: A policy that sees the whole world, such as feedback; a trained one, in its own
+            observations: the folder of its run, its file or zoo:NAME; a recording (.parquet), or a
             folder of recordings.
         episodes: Demonstrations of the teacher.
         protocols: Protocols of these demonstrations: names with commas.
@@ -166,18 +167,21 @@ def clone(
     from scm_world.runs.processes import cores
     from scm_world.training import imitation
 
+    is_policy = from_ is not None and (from_ in NAMED or imitation.is_policy(from_))
     fields = common.fields(
-        teacher=from_ if from_ in NAMED else None,
+        teacher=from_ if is_policy else None,
         episodes=episodes,
         protocols=None if protocols is None else split(protocols),
         noise=noise,
         rounds=rounds,
     )
     made = imitation.lesson(task, **fields)
-    path = None if from_ is None or from_ in NAMED else Path(from_)
+    path = None if from_ is None or is_policy else Path(from_)
     if path is not None and not path.exists():
-        raise UnknownOption("--from", from_, (*NAMED, "a recording or a folder of some"))
-    words = "clone", tag(made.task), made.teacher if path is None else path.stem
+        allowed = "a trained policy or the folder of its run", "a recording or a folder of some"
+        raise UnknownOption("--from", from_, (*NAMED, *allowed))
+    who = made.teacher.replace(":", "-") if path is None else str(path)
+    words = "clone", tag(made.task), Path(who).stem
     with common.job(task, *words, files="demonstrations/*.npz", what="episodes") as job:
         found = imitation.clone(path, made, workers=workers or cores(), **job)
     common.tell(found, task)
@@ -355,9 +359,8 @@ def infer(
     variables: Annotated[str, typer.Option()],
     space: str = "A",
     steps: options.Text = None,
-    at: Annotated[int | None, typer.Option(min=1)] = None,
+    at: Annotated[int | None, typer.Option(min=0)] = None,
     after: Annotated[int | None, typer.Option(min=0)] = None,
-    twins: bool = True,
     privileged: options.Text = None,
     n: options.N = 200,
     seed: options.NotNegative = 0,
@@ -381,9 +384,9 @@ def infer(
         space: Where they are drawn from: A, B or A|B.
         steps: Control steps that are probed, with commas, in addition to the last one; by default
             5,25,100.
-        at: Control step at which a cause is set; by default 25, or a quarter of a shorter episode.
+        at: Control step at which twin episodes set a cause, 0 for none; by default 25, or a quarter
+            of a shorter episode.
         after: Control steps until actions are compared; likewise.
-        twins: Play twin episodes, one for each cause and episode.
         privileged: A policy that sees the causes, to compare the direction of changes.
         n: Episodes.
         seed: Seed of the noise.
@@ -400,8 +403,8 @@ def infer(
     if option:
         settings["task_options"] = dict(made.given)
     folder = console.results_folder(out, "infer", tag(policy), tag(task), variables, str(seed))
-    how: dict[str, Any] = {"task": task, "n": n, "seed": seed, "env": settings, "at": at}
-    how |= {"after": after, "twins": twins, "privileged": privileged}
+    how: dict[str, Any] = {"task": task, "n": n, "seed": seed, "env": settings}
+    how |= {"at": at, "after": after, "privileged": privileged}
     named = (text.partition(":")[0] for text in (policy, privileged or "") if ":" in text)
     if trust:
         how["trusted"] = (*trust, *(name.partition(".")[0] for name in named))

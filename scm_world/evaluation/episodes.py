@@ -376,14 +376,13 @@ def in_world(policy: object, world: World) -> Policy:
         conventions=world.options.conventions.name,
         **options,
     )
-    remembers = agent.card is not None and agent.card.memory > 0
     last = (-1, -1, -1)
 
     def act(now: World) -> Floats:
         nonlocal last
         env.world.restore(now.snapshot())
         present = now.noise.seed, now.episode, now.index
-        if now.index > 0 and remembers and present != (*last[:2], last[2] + 1):
+        if now.index > 0 and agent.remembers and present != (*last[:2], last[2] + 1):
             problem = "a policy with a memory acts from the first control step on, in one world"
             raise ActionError(f"{problem}; make one for each branch, and begin at step 0", None)
         if now.index == 0 or present[:2] != last[:2]:

@@ -21,7 +21,7 @@ from typing import Any, final
 
 import numpy as np
 
-from scm_world._arguments import true_or_false, typed, whole_number
+from scm_world._arguments import typed, whole_number
 from scm_world._patterns import as_names
 from scm_world._types import Floats, Observation
 from scm_world.curricula import at_step, resample, together
@@ -131,7 +131,7 @@ class _Runner:
     setup: Setup
     names: tuple[str, ...]
     steps: tuple[int, ...]
-    twins: tuple[int, int] | None
+    twins: tuple[int, int]
     environments: dict[tuple[str, int], ScmWorldEnv] = field(default_factory=dict)
 
     def __call__(self, shard: Shard) -> Arrays:
@@ -159,19 +159,19 @@ class _Runner:
 
     def changes(self, protocol: Protocol, seed: int, episode: int) -> Arrays:
         """Return how actions change where a cause is set within an episode, a row for each."""
-        if self.twins is None:
+        at, end = self.twins
+        if not at:
             return {}
-        at, after = self.twins
         env, agent, act = self.env(AGENT), self.setup.agents[AGENT], protocol.curriculum()
         under(env, protocol).reset(seed=seed, options={"episode": episode + OTHER})
         row = env.world.evaluate(self.names)
         other = {name: np.array(row[name]) for name in self.names}
-        usual = _Twin(agent, at + after)
+        usual = _Twin(agent, end)
         play(under(env, protocol), agent, hooks=(usual,), seed=seed, episode=episode)
         row = env.world.evaluate(self.names)
         was, found = {name: np.array(row[name]) for name in self.names}, []
         for name, value in other.items():
-            twin, set_there = _Twin(agent, at + after), at_step(at, {name: value})
+            twin, set_there = _Twin(agent, end), at_step(at, {name: value})
             acting = under(env, Protocol("twin", act=together(act, set_there)))
             play(acting, agent, hooks=(twin,), seed=seed, episode=episode)
             one = {"own": twin.own - usual.own, "reaction": twin.reaction - usual.reaction}
@@ -285,7 +285,6 @@ def inferred(
     *,
     task: AnySource | None = None,
     steps: Iterable[int] | None = None,
-    twins: bool = True,
     at: int | None = None,
     after: int | None = None,
     privileged: object = None,
@@ -322,8 +321,8 @@ def inferred(
         task: As in ``evaluate``.
         steps: Control steps whose hidden states are probed, in addition to the last one of each
             episode; 5, 25 and 100 if None, as far as episodes have so many.
-        twins: Whether there are twins.
-        at: Control step at which the cause is set; 25 if None, or a quarter of a shorter episode.
+        at: Control step at which twins set the cause; 25 if None, or a quarter of a shorter
+            episode; 0 for no twins.
         after: How many control steps later the action is compared; likewise.
         privileged: An agent that sees the causes, for the direction of changes, whose memory is
             empty.
@@ -353,7 +352,7 @@ def inferred(
     setup = prepare(agents, protocol, task, n, seed, backend, env, trusted)
     if len(setup.engines) > 1 or {*setup.agents} - {AGENT, PRIVILEGED}:
         raise UnknownOption("policy or backend", "several", ("one",))
-    with closing(_Runner(setup, (), (), None)) as runner:
+    with closing(_Runner(setup, (), (), (0, 0))) as runner:
         here = runner.env(AGENT)
         length = min(here.limit, here.world.max_episode_length)
         wanted = [s for s in STEPS if s < length - 1] if steps is None else [*steps]
@@ -361,12 +360,11 @@ def inferred(
             whole_number("steps", step, least=0, most=length - 1)
         probed = (*dict.fromkeys(wanted), END)
         usual = min(25, length // 4)
-        pair = (
-            whole_number("at", usual if at is None else at, least=1, most=length - 1),
-            whole_number("after", usual if after is None else after, least=0),
-        )
-        whole_number("at + after", sum(pair), least=1, most=length - 1)
-        if true_or_false("twins", twins):
+        start = whole_number("at", usual if at is None else at, least=0)
+        later = whole_number("after", usual if after is None else after, least=0)
+        pair = start, start + later
+        if start:
+            whole_number("at + after", start + later, least=1, most=length - 1)
             here.world.require_exact("a twin of an episode", independent=True)
         under(here, protocol.at(0)).reset(seed=seed, options={"episode": 0})
         compiled = here.world.compiled
@@ -382,7 +380,7 @@ def inferred(
             size = int(np.prod(declared.shape))
             columns += [name] if size == 1 else [f"{name}[{k}]" for k in range(size)]
             logs += [getattr(source, "family", "") in LOGARITHMIC] * size
-    runner = _Runner(setup, names, probed, pair if twins else None)
+    runner = _Runner(setup, names, probed, pair)
     cells = {}
     for shard in setup.shards():
         if (shard.agent, shard.run) == AGENT:
@@ -398,10 +396,10 @@ def inferred(
                 left_out["untrained network"] = "the policy has no method untrained"
         else:
             left_out["probes"] = "the policy has no hidden state"
-        changes = tuple(_changes(arrays, names)) if twins else ()
-    if twins and not changes:
-        left_out["twins"] = f"fewer than {FEWEST} episodes have control step {sum(pair)}"
-    about = setup.about() | {"steps": list(probed), "twins": list(pair) if twins else None}
+        changes = tuple(_changes(arrays, names)) if start else ()
+    if start and not changes:
+        left_out["twins"] = f"fewer than {FEWEST} episodes have control step {pair[1]}"
+    about = setup.about() | {"steps": list(probed), "twins": list(pair)}
     return Inferred(about, tuple(found), changes, left_out)
 
 

@@ -106,6 +106,7 @@ class Agent:
         policy: What ``as_agent`` was given.
         card: What the policy was trained for, if known.
         network: What computes the actions, if it is not the world that is read.
+        remembers: Whether its actions follow from earlier control steps of the episode, too.
     """
 
     @typed
@@ -116,9 +117,12 @@ class Agent:
         policy: object = None,
         card: PolicyAbout | None = None,
         network: object = None,
+        *,
+        remembers: bool = False,
     ) -> None:
         self.about: About = dict(about)
         self.policy, self.card, self.network = policy, card, network
+        self.remembers = remembers
         self._begin = begin
         self._env: PolicyEnv | None = None
         self._act: Actor | None = None
@@ -170,7 +174,7 @@ class Agent:
             FunctionFailure: The method of the policy raised an error.
         """
         ask = getattr(self._act, "hidden", None)
-        if ask is None or self._seen is None:
+        if not callable(ask) or self._seen is None:
             return None
         with blamed(f"the policy {self.about['name']!r}"):
             found = ask(self._seen)
@@ -262,7 +266,7 @@ class _Recurrent:
     def hidden(self, observation: Observation) -> Floats | None:
         """Return the hidden state of the last action, which followed from this observation."""
         ask, state = getattr(self._model, "hidden", None), self._state
-        parts = [] if ask is None else [ask(self._shown(observation), self._before)]
+        parts = [ask(self._shown(observation), self._before)] if callable(ask) else []
         parts += [] if state is None else state if isinstance(state, tuple) else [state]
         return np.concatenate([*map(np.ravel, parts)]) if parts else None
 
@@ -391,8 +395,7 @@ def _of_text(text: str, trusted: SequenceOf[str] | None) -> Agent:
     about["sha256"] = _sha256(path, "give the path of a policy")
     found = load_policy(path) if path.suffix == ".safetensors" else _archived(path, trusted or ())
     if isinstance(found, MlpPolicy):
-        begin = partial(_network, found, about["name"])
-        return Agent(about, begin, text, found.made_for, found)
+        return _of_network(found, about, text)
     return Agent({**about, **_library(SB3)}, partial(_model, found), text)
 
 
@@ -436,8 +439,7 @@ def _of_object(policy: Any, about: About) -> Agent:
         begin = partial(_of_world, inside, about["name"])
         return Agent({**about, "sees": "world"}, begin, policy)
     if isinstance(made, MlpPolicy):
-        about = {**about, "sha256": made.sha256}
-        return Agent(about, partial(_network, made, about["name"]), policy, made.made_for, made)
+        return _of_network(made, {**about, "sha256": made.sha256}, policy)
     if not hasattr(made, "predict"):
         return Agent(about, partial(_function, made), policy, network=made)
     try:
@@ -446,6 +448,11 @@ def _of_object(policy: Any, about: About) -> Agent:
         return Agent(about, partial(_model, made), policy, network=made)
     begin = partial(_model, made, seen=seen_through(made.get_env()))
     return Agent(about, begin, policy, card, made)
+
+
+def _of_network(network: MlpPolicy, about: About, policy: object) -> Agent:
+    begin, remembers = partial(_network, network, about["name"]), network.n_remembered > 0
+    return Agent(about, begin, policy, network.made_for, network, remembers=remembers)
 
 
 def _description(policy: object) -> About:

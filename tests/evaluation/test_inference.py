@@ -155,12 +155,12 @@ def test_a_policy_of_the_world_reacts_without_memory() -> None:
     assert (memory.size.value, memory.verdict) == (0.0, "no change")
     assert (found.probes, found.verdicts()) == ((), {})
     assert "no hidden state" in str(found)
-    assert found.about["twins"] == [3, 2]
+    assert found.about["twins"] == [3, 5]
 
 
 def test_without_memory_nothing_is_inferred_and_what_is_seen_is_not() -> None:
     """The mass is not in the velocity; where a scale shows it, the observation is the reason."""
-    found = inferred(Blind(), "mass", task=Cart(), twins=False, **HOW)
+    found = inferred(Blind(), "mass", task=Cart(), at=0, **HOW)
     assert found.verdicts()["mass"].startswith("no")
     assert found.changes == ()
 
@@ -168,7 +168,7 @@ def test_without_memory_nothing_is_inferred_and_what_is_seen_is_not() -> None:
         def hidden(self, observation: Any) -> Any:
             return observation
 
-    found = inferred(Reader(), "mass", task=Weighed(), twins=False, **HOW)
+    found = inferred(Reader(), "mass", task=Weighed(), at=0, **HOW)
     assert found.probes[-1].scores["hidden"]["linear"].value > 0.99
     assert found.verdicts() == {"mass": "no: observation"}
 
@@ -190,7 +190,7 @@ def test_networks_have_an_untrained_control() -> None:
     assert other.tensors().keys() == tensors.keys()
     assert not np.array_equal(other.hidden(seen), policy.hidden(seen))
     assert np.array_equal(other.hidden(seen), policy.untrained(3).hidden(seen))
-    found = inferred(policy, "mass", task=Weighed(), twins=False, n=24, env=FROM_REST)
+    found = inferred(policy, "mass", task=Weighed(), at=0, n=24, env=FROM_REST)
     scores = found.probes[-1].scores
     assert scores["untrained"]["kernel"].value > 0.9
     assert found.verdicts()["mass"].startswith("no")
@@ -247,7 +247,7 @@ def test_results_do_not_depend_on_workers_and_are_kept(tmp_path: Path) -> None:
 def test_causes_that_matter_and_are_not_inferred_are_marked() -> None:
     """The table of causes has what the agent infers, and names the cause that it lacks."""
     found = evaluate(Blind(), "A", task=Cart(), n=40, env={**HOW["env"], **FROM_REST})
-    judged = inferred(Blind(), "mass", task=Cart(), twins=False, **HOW)
+    judged = inferred(Blind(), "mass", task=Cart(), at=0, **HOW)
     text = str(found.causes("A", inferred=judged))
     assert "mass matters, and the agent does not infer it (no)" in text
     assert "color" in text
@@ -264,7 +264,7 @@ def test_the_command_writes_and_explain_reads(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     assert "no change" in done.output
     found = Inferred.load(tmp_path / "inferred.json")
-    assert (found.about["steps"], found.about["twins"]) == ([3, -1], [2, 1])
+    assert (found.about["steps"], found.about["twins"]) == ([3, -1], [2, 3])
     evaluate(agent, "A", task=task, n=20, env=FROM_REST).save(tmp_path)
     given = ["explain", str(tmp_path), f"--inferred={tmp_path / 'inferred.json'}"]
     done = call(given)
@@ -286,7 +286,7 @@ def test_logarithmic_spaces_are_probed_on_their_scale() -> None:
             return [np.log(observation[1])]
 
     wide = {"mass": Continuous("loguniform", a=0.01, b=10.0)}
-    found = inferred(Reader(), wide, task=Told(), twins=False, **HOW)
+    found = inferred(Reader(), wide, task=Told(), at=0, **HOW)
     assert found.probes[-1].scores["hidden"]["linear"].value > 0.999
 
 
@@ -296,7 +296,7 @@ def test_logarithmic_spaces_are_probed_on_their_scale() -> None:
         ({"variables": "force"}, "force"),
         ({"variables": {}}, "variables"),
         ({"steps": (12,)}, "steps"),
-        ({"at": 0}, "at"),
+        ({"at": -1}, "at"),
         ({"at": 6, "after": 6}, "at \\+ after"),
         ({"policy": [Blind(), Blind()]}, "several"),
         ({"backend": "step,fake"}, "fake"),
