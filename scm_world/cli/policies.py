@@ -77,6 +77,7 @@ def train(
     threads: int | None = None,
     start: Path | None = None,
     device: str = "auto",
+    log: options.Text = None,
     onnx: bool = False,
     show_recipe: bool = False,
     common: Training,
@@ -97,6 +98,8 @@ def train(
             backend, and one for torch.
         start: Policy to start from.
         device: auto, cpu or cuda.
+        log: Where the numbers of each round go besides progress.csv: tensorboard, wandb or trackio,
+            several with commas; by default tensorboard, if the library has it.
         onnx: Write the policy as ONNX, too.
         show_recipe: Print the recipe as JSON, and do nothing.
     """
@@ -123,7 +126,7 @@ def train(
 
     words = "train", tag(made.task), made.algo, made.name
     with common.job(task, *words, files="checkpoints/*.zip", what="steps") as job:
-        found = loop.train(made, start=start, device=device, threads=threads, **job)
+        found = loop.train(made, start=start, device=device, threads=threads, log=log, **job)
     common.tell(found, made.task)
     if onnx:
         from scm_world.training.export import to_onnx

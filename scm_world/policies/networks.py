@@ -42,7 +42,7 @@ from scm_world._arguments import true_or_false, typed, whole_number
 from scm_world._types import ArrayLike, Floats
 from scm_world.errors import ActionError, ModelError, UnknownOption, reading
 from scm_world.geometry.numbers import njit
-from scm_world.policies.cards import KEY, PolicyAbout
+from scm_world.policies.cards import HISTORY, KEY, PolicyAbout
 from scm_world.runs.files import Location, located, read_arrays, read_bytes, write_whole
 from scm_world.tasks import tasks
 
@@ -256,7 +256,11 @@ class MlpPolicy:
                 raise ActionError(
                     f"the policy observes {wanted}, got the parts {[*observation]}; {_ENV}", None
                 )
-            seen = np.concatenate([np.asarray(observation[name]) for name in inputs], axis=-1)
+            arrays = {name: np.asarray(observation[name]) for name in inputs}
+            if HISTORY in inputs and arrays[HISTORY].ndim > 1:  # a row for each step
+                past = arrays[HISTORY]
+                arrays[HISTORY] = past.reshape(*past.shape[:-2], -1)
+            seen = np.concatenate([*arrays.values()], axis=-1)
         elif inputs is not None:
             raise ActionError(f"the policy observes the parts {[*inputs]} by name; {_ENV}", None)
         else:

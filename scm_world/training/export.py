@@ -20,7 +20,7 @@ from scm_world.errors import (
 )
 from scm_world.evaluation import evaluate
 from scm_world.policies import MlpPolicy, PolicyAbout, load_policy, save_policy
-from scm_world.policies.cards import FORM, KEY, OPTIONS
+from scm_world.policies.cards import FORM, HISTORY, KEY, OPTIONS
 from scm_world.policies.wrappers import LinearMap, samples, seen_through
 from scm_world.runs.files import read_text, write_whole
 from scm_world.training.recipe import Recipe
@@ -307,8 +307,10 @@ def to_onnx(policy: MlpPolicy | Path | str, path: Path | str) -> Path:
     seen, nodes = "observation", []
     inputs = [f"float[N, {given.n_observed}] observation"]
     if about.inputs is not None:
-        inputs = [f"{'double' if n in GOALS else 'float'}[N, ?] {n}" for n in about.inputs]
-        nodes += [f"{name}_single = Cast<to = 1>({name})" for name in about.inputs]
+        kinds = {**dict.fromkeys(GOALS, "double[N, ?]"), HISTORY: "float[N, ?, ?]"}
+        inputs = [f"{kinds.get(name, 'float[N, ?]')} {name}" for name in about.inputs]
+        nodes += [f"{name}_flat = Flatten<axis = 1>({name})" for name in about.inputs]
+        nodes += [f"{name}_single = Cast<to = 1>({name}_flat)" for name in about.inputs]
         joined = ", ".join(f"{name}_single" for name in about.inputs)
         seen = "joined"
         nodes.append(f"{seen} = Concat<axis = 1>({joined})")

@@ -74,6 +74,7 @@ ONLY: Mapping[str, tuple[Any, ...]] = {
     "normalize_actions": (True,),
     "observation_mode": ("structured", "full", "custom"),
     "context": ("none", "observation"),
+    "stack_history": (False,),
     "goal_env": (False,),
 }
 """Options whose other values give no vector of numbers, or actions that are not in [-1, 1]."""

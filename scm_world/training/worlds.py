@@ -76,9 +76,9 @@ def scales(layout: Mapping[str, Any], space: Any, env: Mapping[str, Any]) -> Flo
         raise UnknownOption("normalize_observations with network.scaled", False, ("True",))
     found = []
     for key, part in getattr(space, "spaces", {"observation": space}).items():
-        scale = np.ones(part.shape[0])
+        scale = np.ones(int(np.prod(part.shape)))
         for name, where in layout.items() if key == "observation" else ():
-            scale[where] = SCALES.get(name.rpartition(".")[2], 1.0)
+            scale[where] = SCALES.get(name.partition("@")[0].rpartition(".")[2], 1.0)
         found.append(scale)
     return np.concatenate(found)
 
