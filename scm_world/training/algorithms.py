@@ -27,6 +27,7 @@ from scm_world.queries.progress import Progress, Tell
 from scm_world.runs.files import make_folder, read_arrays
 from scm_world.runs.study import Study
 from scm_world.training.export import begin_with, exported
+from scm_world.training.logs import Log
 from scm_world.training.recipe import Recipe
 from scm_world.training.rounds import Rounds, restore_last
 from scm_world.training.sb3 import Sb3VecEnv
@@ -39,7 +40,7 @@ try:
     import torch
     from stable_baselines3.common.base_class import BaseAlgorithm
     from stable_baselines3.common.callbacks import BaseCallback
-    from stable_baselines3.common.logger import Logger, make_output_format
+    from stable_baselines3.common.logger import KVWriter, Logger, make_output_format
     from stable_baselines3.common.noise import NormalActionNoise
     from stable_baselines3.common.policies import ActorCriticPolicy
     from stable_baselines3.common.save_util import load_from_zip_file, recursive_setattr
@@ -322,10 +323,13 @@ def learn(
     progress: Progress | None,
     tell: Tell,
     begun: bool,
+    log: Log,
+    callback: BaseCallback | None,
+    tensorboard: bool,
 ) -> float | None:
     """Learn the steps that are left since the last checkpoint; return the best score.
 
-    ``begun`` is whether the weights are those of a policy.
+    ``begun`` is whether the weights are those of a policy; ``log`` takes the numbers of each round.
 
     Raises:
         UnwritableFolder: The disk is full, or permission is missing.
@@ -340,11 +344,35 @@ def learn(
         tell(f"{said}: give it with --start; now the weights are random")
     watch = Watch(recipe, study, backend=backend, card=card, progress=progress, tell=tell)
     if recipe.steps > model.num_timesteps:
-        _learn(model, watch, Path(str(study.folder)))
+        folder, before = Path(str(study.folder)), model.num_timesteps
+        outputs = [
+            make_output_format("csv", str(folder), f"-{before}" if before else ""),
+            Numbers(log),
+        ]
+        if tensorboard:
+            place = str(make_folder(folder / "tensorboard"))
+            outputs.append(make_output_format("tensorboard", place))
+        model.set_logger(Logger(str(folder), outputs))
+        _learn(model, watch, callback, folder)
     return watch.score
 
 
-def _learn(model: BaseAlgorithm, watch: Watch, folder: Path) -> None:
+@final
+class Numbers(KVWriter):
+    """Passes the numbers of a round on."""
+
+    def __init__(self, log: Log) -> None:
+        self._log = log
+
+    def write(self, key_values: dict[str, Any], key_excluded: object, step: int = 0) -> None:
+        """Pass them on."""
+        self._log(key_values, step)
+
+    def close(self) -> None:
+        """Leave them to who has opened them."""
+
+
+def _learn(model: BaseAlgorithm, watch: Watch, callback: BaseCallback | None, folder: Path) -> None:
     """Learn the remaining steps; write curves, checkpoints and the policy.
 
     Raises:
@@ -352,15 +380,13 @@ def _learn(model: BaseAlgorithm, watch: Watch, folder: Path) -> None:
         Diverged: Weights are not finite any more.
     """
     recipe, before = watch.recipe, model.num_timesteps
-    outputs = [
-        make_output_format("csv", str(folder), f"-{before}" if before else ""),
-        make_output_format("tensorboard", str(make_folder(folder / "tensorboard"))),
-    ]
-    model.set_logger(Logger(str(folder), outputs))
     every = 1 if isinstance(recipe.settings, Ppo) else recipe.worlds  # rounds, or episodes
     try:
         model.learn(
-            recipe.steps - before, callback=watch, reset_num_timesteps=False, log_interval=every
+            recipe.steps - before,
+            callback=[watch] if callback is None else [watch, callback],
+            reset_num_timesteps=False,
+            log_interval=every,
         )
     except KeyboardInterrupt:
         watch.save()
@@ -422,6 +448,9 @@ class Watch(BaseCallback):
 
     def _on_training_end(self) -> None:
         self._look()
+        steps = self.model.num_timesteps
+        self.logger.record("time/total_timesteps", steps, exclude="tensorboard")
+        self.logger.dump(steps)  # with the last evaluation
         self.save()
         if self._failed:
             where = "env={'on_failure': 'raise'} ends the training there and says why"

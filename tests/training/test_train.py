@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import errno
 import io
 import json
@@ -11,6 +12,7 @@ import sys
 import zipfile
 from contextlib import closing
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import gymnasium
@@ -352,6 +354,69 @@ def test_a_run_is_whole(tmp_path: Path) -> None:
     again = run("ppo", folder)
     assert (again.best, again.score) == (found.best, found.score)
     assert again.policy.read_bytes() == before
+
+
+class Tracker(ModuleType):
+    """The interface that wandb and trackio have in common, as they have it."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self.runs: list[dict[str, Any]] = []
+
+    def init(self, project: str, name: str, config: Any, resume: str, **more: Any) -> None:
+        """Begin a run, or go on with one of this name."""
+        assert (more == {"id": name}) == (self.__name__ == "wandb")
+        self.runs.append({"about": (project, name, resume), "algo": config["recipe"]["algo"]})
+        self.runs[-1] |= {"steps": [], "rows": [], "finished": False}
+
+    def log(self, numbers: dict[str, Any], step: int) -> None:
+        """Keep numbers."""
+        self.runs[-1]["steps"].append(step)
+        self.runs[-1]["rows"].append(numbers)
+
+    def finish(self) -> None:
+        """End the run."""
+        self.runs[-1]["finished"] = True
+
+
+def test_trackers_and_a_callback_get_the_numbers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of the learning curve; a resumed run goes on under its name."""
+    trackers = {name: Tracker(name) for name in ("wandb", "trackio")}
+    for name, tracker in trackers.items():
+        monkeypatch.setitem(sys.modules, name, tracker)
+    heard: list[dict[str, Any]] = []
+    out, log = tmp_path / "run", "wandb,trackio"
+    run("ppo", out, steps=128, log=log, callback=heard.append)
+    run("ppo", out, log=["wandb", "trackio"], callback=heard.append)
+    first, second = trackers["wandb"].runs
+    assert first["about"] == second["about"]
+    assert first["about"][::2] == ("scm-world", "allow")
+    assert (first["algo"], first["finished"], second["finished"]) == ("ppo", True, True)
+    assert first["steps"] == [32, 64, 96, 128, 128]  # at last with the evaluation
+    assert second["steps"] == [160, 192, 224, 256, 256]
+    rows = [*first["rows"], *second["rows"]]
+    assert heard == rows == [row for one in trackers["trackio"].runs for row in one["rows"]]
+    with (out / "progress.csv").open() as file:
+        curve = list(csv.DictReader(file))
+    for row, line in zip(first["rows"], curve, strict=True):
+        assert {name: float(text) for name, text in line.items() if text} == pytest.approx(row)
+    assert "evaluation/P0" in rows[-1]
+    assert not (out / "tensorboard").exists()
+
+    class Stop(sb3.common.callbacks.BaseCallback):  # type: ignore[name-defined,misc]
+        def _on_step(self) -> bool:
+            return bool(self.num_timesteps < 64)
+
+    assert run("ppo", tmp_path / "stopped", callback=Stop()).steps == 64
+    with pytest.raises(UnknownOption, match="callback"):
+        run("ppo", tmp_path / "no", callback=3)
+    with pytest.raises(UnknownOption, match="log of ppo"):
+        run("ppo", tmp_path / "no", log="mlflow")
+    monkeypatch.setitem(sys.modules, "trackio", None)
+    with pytest.raises(MissingExtra, match="pip install trackio"):
+        run("ppo", tmp_path / "no", log="trackio")
 
 
 def test_one_training_is_not_another(tmp_path: Path) -> None:
