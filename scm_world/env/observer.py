@@ -100,6 +100,9 @@ class GoalVectors:
 MODES = ("structured", "full", "pixel", "custom")
 CONTEXTS = ("none", "observation", "privileged")
 
+LONGEST = 1_000
+"""Most pairs of a history."""
+
 EVERY = ("*",)
 """The pattern of all parameters."""
 
@@ -135,7 +138,7 @@ def check_options(how: Mapping[str, Any]) -> None:
     flags = ("normalize_actions", "normalize_observations", "goal_env")
     for option in (*flags, "stack_images", "stack_history"):
         true_or_false(option, how[option])
-    steps = whole_number("history", how["history"], least=0)
+    steps = whole_number("history", how["history"], least=0, most=LONGEST)
     if how["stack_history"] and not steps:
         raise UnknownOption("stack_history", True, ("False without history", "True with history=k"))
     if keypoints is not False:
