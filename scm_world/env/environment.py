@@ -137,9 +137,9 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
             ``CnnPolicy`` of Stable-Baselines3) take them.
         normalize_observations: Give numbers in [-1, 1] instead of SI units.
         history: How many last pairs of observation and action, at most 1,000, follow the present
-            observation, the newest first: n + history * (n + n_actions) numbers, zeros where there was no step. The
-            observation of a pair is that of the instant in which the action was taken, and the
-            action is the agent's, clipped to ``action_space``.
+            observation, the newest first: n + history * (n + n_actions) numbers, zeros where there
+            was no step. The observation of a pair is that of the instant in which the action was
+            taken, and the action is the agent's, clipped to ``action_space``.
         stack_history: Give a dictionary with ``observation`` and ``history``, shape (history, n +
             n_actions), instead.
         goal_env: Give a dictionary with ``observation``, ``achieved_goal``, ``desired_goal``, as
