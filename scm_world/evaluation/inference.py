@@ -360,7 +360,7 @@ def inferred(
             whole_number("steps", step, least=0, most=length - 1)
         probed = (*dict.fromkeys(wanted), END)
         usual = min(25, length // 4)
-        start = whole_number("at", usual if at is None else at, least=0)
+        start = whole_number("at", max(usual, 1) if at is None else at, least=0)
         later = whole_number("after", usual if after is None else after, least=0)
         pair = start, start + later
         if start:
@@ -431,7 +431,7 @@ def _played(
     return joined([found[name] for name in cells], np.concatenate)
 
 
-def _archive(arrays: Arrays) -> bytes:
+def _archive(arrays: Mapping[str, Any]) -> bytes:
     content = io.BytesIO()
-    np.savez(content, allow_pickle=False, **arrays)
+    np.savez(content, **arrays)
     return content.getvalue()
