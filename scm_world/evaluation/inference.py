@@ -112,7 +112,7 @@ class _Twin(Hook):
         if self._env.world.index == self._step:
             self.own, self.world = np.array(action, np.float64).ravel(), self._env.world.snapshot()
             if (history := getattr(self._env, "history", None)) is not None:
-                history.clear()
+                history.rows[:] = 0.0
             self._agent.start(self._env)
             emptied = self._agent.act(self._env.observe())
             self.reaction = np.array(emptied, np.float64).ravel()
@@ -269,7 +269,7 @@ def _changes(arrays: Arrays, names: Sequence[str]) -> Iterator[Change]:
             one = Change(name, part, _mean(lengths), _mean(_along(signed)), chance)
             both = lengths * np.linalg.norm(other, axis=1)
             if (both > 0.0).sum() > 1:
-                cosines = ((moved * other).sum(axis=1) / both)[both > 0.0]
+                cosines = (moved * other).sum(axis=1)[both > 0.0] / both[both > 0.0]
                 by_chance = _by_chance(flips[:, : len(cosines)] * cosines)
                 one = replace(one, agreement=_mean(cosines), flipped=by_chance)
             yield one

@@ -227,6 +227,22 @@ def test_a_memory_is_part_of_the_hidden_state(kind: str) -> None:
     assert as_agent("still").hidden() is None
 
 
+def test_the_memory_of_a_model_is_its_hidden_state() -> None:
+    """As recurrent models of Stable-Baselines3 have it: output and cell, each (layers, n, size)."""
+
+    class Model:
+        def predict(self, observation: Any, state: Any = None, **how: Any) -> Any:
+            count = 0.0 if state is None else state[0].item()
+            return np.zeros(1), (np.full((1, 1, 1), count + 1.0), np.full((1, 1, 2), -count))
+
+    agent, env = as_agent(Model()), ScmWorldEnv(Cart())
+    observation, _ = env.reset(seed=0)
+    agent.start(env)
+    for count in range(3):
+        agent.act(observation)
+        assert np.array_equal(agent.hidden(), [count + 1.0, -count, -count])
+
+
 def test_results_do_not_depend_on_workers_and_are_kept(tmp_path: Path) -> None:
     """The same numbers from two processes, from finished shards, and from a file."""
     how: Any = {"task": Cart, "n": 30, "env": HOW["env"], "out": tmp_path / "out"}
