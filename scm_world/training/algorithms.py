@@ -81,9 +81,11 @@ class Episodes(VecMonitor):
         return seen
 
 
-def make_worlds(recipe: Recipe, *, backend: str, threads: int | None = None) -> Episodes:
+def make_worlds(
+    recipe: Recipe, *, backend: str, threads: int | None = None, seed: int = 0
+) -> Episodes:
     """Make the worlds of a recipe for Stable-Baselines3; see ``make_envs``."""
-    envs = make_envs(recipe, backend=backend, threads=threads)
+    envs = make_envs(recipe, backend=backend, threads=threads, seed=seed)
     try:
         vec_env = Sb3VecEnv(envs, [])
         (there,) = vec_env.get_attr("info_shapes", 0)
@@ -248,7 +250,7 @@ def restore(model: BaseAlgorithm, content: bytes, steps: int, memory: Path) -> s
     for name, tensor in (variables or {}).items():
         recursive_setattr(model, f"{name}.data", tensor.data.to(model.device))
     model.num_timesteps = steps
-    if isinstance(model, stable_baselines3.PPO) and not callable(model.learning_rate):
+    if hasattr(model, "clip_range") and not callable(model.learning_rate):
         model.learning_rate = model.policy.optimizer.param_groups[0]["lr"]  # it may adapt
         model._setup_lr_schedule()
     if not _remembered(model):
@@ -275,7 +277,7 @@ def opened(
     recipe: Recipe, *, backend: str, seed: int, device: str, threads: int | None
 ) -> Iterator[tuple[BaseAlgorithm, Any]]:
     """Make the algorithm of a recipe with its worlds; yield it, and one of them."""
-    with closing(make_worlds(recipe, backend=backend, threads=threads)) as worlds:
+    with closing(make_worlds(recipe, backend=backend, threads=threads, seed=seed)) as worlds:
         (world,) = worlds.get_attr("world", 0)
         yield make_learner(recipe, worlds, seed=seed, device=device), world
 
@@ -391,6 +393,7 @@ class Watch(BaseCallback):
         self.recipe, self._study, self._card, self._tell = recipe, study, dict(card), tell
         self._over = self._failed = 0  # episodes since the training began or was resumed
         about: dict[str, Any] = {"backend": backend, "progress": progress, "tell": tell}
+        about["seed"] = self._card["seed"]
         self._rounds = Rounds(recipe, study, **about, save=self.save, policy=self._policy)
 
     @property

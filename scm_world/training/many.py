@@ -76,7 +76,7 @@ class ManyPpo:
         self, recipe: Recipe, *, backend: str, seed: int, device: str, threads: int | None
     ) -> None:
         self.recipe, self.device, self.num_timesteps = recipe, device, 0
-        self._envs: Any = make_envs(recipe, backend=backend, threads=threads)
+        self._envs: Any = make_envs(recipe, backend=backend, threads=threads, seed=seed)
         try:
             self._build(seed)
         except BaseException:
@@ -343,6 +343,7 @@ def learn(
     first = model.num_timesteps
     curve, rows = folder / (f"progress-{first}.csv" if first else "progress.csv"), []
     how: dict[str, Any] = {"backend": backend, "progress": progress, "tell": tell}
+    how["seed"] = card["seed"]
     rounds = Rounds(recipe, study, **how, save=save, policy=policy)
     rounds.begin(first)
     try:

@@ -68,6 +68,10 @@ class Recipe(Frozen):
         name: ``"tuned"`` where it comes from ``recipe``.
         env: Options of the environment.
         curriculum: Interventions in it; plain data of a ``Curriculum``.
+        levels: Train on so many draws of the curriculum and the noise: each episode is one of them,
+            drawn uniformly. Level i is episode i of the noise ``training.worlds.level_seed``.
+            Trials then have scores on these levels (the first ``trials.episodes``) and on new
+            draws, and the gap between both. None: new draws for ever.
         worlds: How many are simulated together.
         steps: Control steps of training, in all worlds together.
         settings: Settings of the algorithm.
@@ -88,6 +92,7 @@ class Recipe(Frozen):
     name: str = "own"
     env: dict[str, Any] = Field(default_factory=dict)
     curriculum: dict[str, Any] = Field(default_factory=PUBLISHED["0"].as_dict)
+    levels: Count | None = None
     worlds: Count = 64
     steps: Count = 1_000_000
     settings: SerializeAsAny[Ppo | OffPolicy] = Field(default_factory=Ppo)
@@ -167,6 +172,10 @@ class Recipe(Frozen):
                 raise UnknownOption(f"{name} with {self.algo}", True, ("none: it is of PPO",))
             if self.hindsight is not None and self.settings.n_steps > 1:
                 raise UnknownOption("n_steps with hindsight", self.settings.n_steps, ("1",))
+        parts = as_curriculum(self.curriculum).parts() if self.levels else ()
+        if any(part.kind == "stages" for part in parts):
+            none = "None: stages follow from the episodes before"
+            raise UnknownOption("levels of a curriculum with stages", self.levels, (none,))
         if self.steps < self.round:
             least = f"at least {self.round:,}: {self.worlds} worlds make so many in one round"
             raise UnknownOption("steps", self.steps, (least,))

@@ -34,10 +34,16 @@ SCALES: Mapping[str, float] = {
 """Factor of a normalized number, by its quantity, so that it varies by about one."""
 
 
-def make_envs(recipe: Recipe, *, backend: str, threads: int | None = None) -> Any:
+def level_seed(seed: int) -> int:
+    """Return the seed of the noise of the levels of a training."""
+    return (seed + 1) * SEEDS
+
+
+def make_envs(recipe: Recipe, *, backend: str, threads: int | None = None, seed: int = 0) -> Any:
     """Make the environments of a recipe, in which the next episode begins in the same step.
 
     A backend that steps many worlds in one call has ``threads``, another one as many processes.
+    The seed is that of the training: it decides its levels, if there are some.
 
     Raises:
         UnknownOption: Actions are choices, which policies of files do not have.
@@ -49,6 +55,8 @@ def make_envs(recipe: Recipe, *, backend: str, threads: int | None = None) -> An
         recipe.worlds,
         as_curriculum(recipe.curriculum),
         autoreset_mode=AutoresetMode.SAME_STEP,
+        levels=recipe.levels,
+        level_seed=level_seed(seed),
         backend=backend,
         task=recipe.task,
         **{several: threads},
