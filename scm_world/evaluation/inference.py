@@ -111,8 +111,8 @@ class _Twin(Hook):
         """Act once more at the control step, after the memory and the history are lost."""
         if self._env.world.index == self._step:
             self.own, self.world = np.array(action, np.float64).ravel(), self._env.world.snapshot()
-            if (history := getattr(self._env, "history", None)) is not None:
-                history.rows[:] = 0.0
+            if self._env.history is not None:
+                self._env.history.rows[:] = 0.0
             self._agent.start(self._env)
             emptied = self._agent.act(self._env.observe())
             self.reaction = np.array(emptied, np.float64).ravel()
