@@ -332,7 +332,7 @@ CASES: dict[str, Case] = {
         lambda **k: str(
             evaluation.evaluate("still", "P5", env={"max_episode_length": 2}, backend="fake", **k)
         ),
-        {"n": 2, "workers": 1},
+        {"n": 2, "workers": 1, "steps": True},
     ),
     "play": (
         lambda **k: evaluation.play(gymnasium.make(PUSHING, **SHORT), STILL, **k)[
