@@ -226,6 +226,7 @@ CASES: dict[str, Case] = {
             "goal_env": False,
             "max_episode_length": 7,
             "stack_images": False,
+            "stack_history": False,
         },
     ),
     "ScmWorldEnv.delta": (

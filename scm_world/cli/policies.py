@@ -82,6 +82,7 @@ def train(
     threads: int | None = None,
     start: Path | None = None,
     device: str = "auto",
+    log: options.Text = None,
     onnx: bool = False,
     show_recipe: bool = False,
     common: Training,
@@ -92,8 +93,8 @@ def train(
     Example: scm-world train reaching --set n_steps=128 --out my-reacher
 
     Args:
-        algo: ppo, sac or td3 of Stable-Baselines3, or rsl_ppo of rsl-rl; by default ppo, on an
-            engine that steps thousands of worlds together rsl_ppo.
+        algo: ppo, sac or td3 of Stable-Baselines3, recurrent_ppo of sb3-contrib, or rsl_ppo of
+            rsl-rl; by default ppo, on an engine that steps thousands of worlds together rsl_ppo.
         curriculum: Variation: 0 for none, 1 for goals, 2 for everything (gravity and gains, too),
             a protocol such as P10, or the JSON file of a curriculum; by default the tuned one.
         recipe: JSON file of a recipe; by default the one tuned for the task.
@@ -102,6 +103,8 @@ def train(
             backend, and one for torch.
         start: Policy to start from.
         device: auto, cpu or cuda.
+        log: Where the numbers of each round go besides progress.csv: tensorboard, wandb or trackio,
+            several with commas; by default tensorboard, if the library has it.
         onnx: Write the policy as ONNX, too.
         show_recipe: Print the recipe as JSON, and do nothing.
     """
@@ -128,7 +131,7 @@ def train(
 
     words = "train", tag(made.task), made.algo, made.name
     with common.job(task, *words, files="checkpoints/*.zip", what="steps") as job:
-        found = loop.train(made, start=start, device=device, threads=threads, **job)
+        found = loop.train(made, start=start, device=device, threads=threads, log=log, **job)
     common.tell(found, made.task)
     if onnx:
         from scm_world.training.export import to_onnx
@@ -147,7 +150,7 @@ def clone(
     workers: options.ManyWorkers = 0,
     common: Training,
 ) -> None:
-    """Train a network by imitation of a scripted policy, or of recordings.
+    """Train a network by imitation of a scripted or trained policy, or of recordings.
 
     Episodes that end well are learned from. After an interruption the same command resumes.
     'scm-world evaluate' takes the policy. 'scm-world train --start' starts from it where the recipe
@@ -156,7 +159,8 @@ def clone(
     Example: scm-world clone picking --episodes 200 --out my-picker
 
     Args:
-        from_: A policy that sees the whole world, such as feedback; a recording (.parquet), or a
+        from_: A policy that sees the whole world, such as feedback; a trained one, in its own
+            observations: the folder of its run, its file or zoo:NAME; a recording (.parquet), or a
             folder of recordings.
         episodes: Demonstrations of the teacher.
         protocols: Protocols of these demonstrations: names with commas.
@@ -171,18 +175,21 @@ def clone(
     from scm_world.runs.processes import cores
     from scm_world.training import imitation
 
+    is_policy = from_ is not None and (from_ in NAMED or imitation.is_policy(from_))
     fields = common.fields(
-        teacher=from_ if from_ in NAMED else None,
+        teacher=from_ if is_policy else None,
         episodes=episodes,
         protocols=None if protocols is None else split(protocols),
         noise=noise,
         rounds=rounds,
     )
     made = imitation.lesson(task, **fields)
-    path = None if from_ is None or from_ in NAMED else Path(from_)
+    path = None if from_ is None or is_policy else Path(from_)
     if path is not None and not path.exists():
-        raise UnknownOption("--from", from_, (*NAMED, "a recording or a folder of some"))
-    words = "clone", tag(made.task), made.teacher if path is None else path.stem
+        allowed = "a trained policy or the folder of its run", "a recording or a folder of some"
+        raise UnknownOption("--from", from_, (*NAMED, *allowed))
+    who = made.teacher.replace(":", "-") if path is None else str(path)
+    words = "clone", tag(made.task), Path(who).stem
     with common.job(task, *words, files="demonstrations/*.npz", what="episodes") as job:
         found = imitation.clone(path, made, workers=workers or cores(), **job)
     common.tell(found, task)

@@ -193,7 +193,7 @@ def why(
     setup = again(evaluation.only(agent=agent, engine=engine), policy, task, trusted)
     actor, done_there = setup.agents[agent, run], setup.protocols[protocol]
     draw, attempt = divmod(episode, done_there.repeats)
-    if attempt and actor.remembers:
+    if attempt and actor.keeps:
         allowed = (f"{episode - attempt}, the first of its draw: {agent!r} remembers the others",)
         raise UnknownOption("episode", episode, allowed)
     where: dict[str, Any] = {"seed": seed, "episode": episode, "who": (agent, run)}

@@ -110,6 +110,7 @@ class Agent:
         begin: Returns the actor of the episode that an environment has begun.
         policy: What ``as_agent`` was given.
         card: What the policy was trained for, if known.
+        remembers: Whether its actions follow from earlier control steps of the episode, too.
     """
 
     @typed
@@ -119,9 +120,11 @@ class Agent:
         begin: Callable[[PolicyEnv], Actor],
         policy: object = None,
         card: PolicyAbout | None = None,
+        *,
+        remembers: bool = False,
     ) -> None:
         self.about: About = dict(about)
-        self.policy, self.card = policy, card
+        self.policy, self.card, self.remembers = policy, card, remembers
         self._begin = begin
         self._env: PolicyEnv | None = None
         self._act: Actor | None = None
@@ -141,13 +144,13 @@ class Agent:
             self._env, self._act = env, self._begin(env)
 
     @property
-    def remembers(self) -> bool:
-        """Whether its policy remembers episodes until ``forget`` is called."""
+    def keeps(self) -> bool:
+        """Whether its policy remembers earlier episodes, too, until ``forget`` is called."""
         return callable(getattr(self.policy, "forget", None))
 
     def forget(self) -> None:
         """Forget all episodes; called where the next one has nothing in common with them."""
-        if self.remembers:
+        if self.keeps:
             with blamed(f"the policy {self.about['name']!r}"):
                 cast("Any", self.policy).forget()
 
@@ -265,7 +268,7 @@ def _network(policy: MlpPolicy, name: str, env: PolicyEnv) -> Actor:
     if policy.made_for is not None:
         policy.made_for.check(env, name)
     policy.check(env.observe(), env.world.compiled.n_actions)
-    return _model(policy, env) if policy.about.memory else policy
+    return _model(policy, env) if policy.n_remembered else policy
 
 
 def _of_world(given: str | Policy, name: str, env: PolicyEnv) -> Actor:
@@ -335,7 +338,7 @@ def as_agent(
     card = PolicyAbout.of({"task": ANY if known is None else known.task, "env": env})
     if known is None:
         begin = partial(_formed, found._begin, card, name)
-        return Agent(found.about, begin, found.policy, card)
+        return Agent(found.about, begin, found.policy, card, remembers=found.remembers)
     for option, given in card.env.items():
         if known.option(option) not in (given, None):
             raise contradiction(option, given, known.option(option), name)
@@ -367,7 +370,8 @@ def agent_from(
         return as_agent(name, env=env)
     if kind == "function":
         found = _resolved(name, trusted)
-        if about.get("sees") == "world" and not isinstance(found, WorldPolicy):
+        sees = about.get("sees") == "world" and not hasattr(found, "act")
+        if sees and not isinstance(found, WorldPolicy):
             found = WorldPolicy(found)
         return as_agent(_of_object(found, {"kind": kind, "name": name, **_library(name)}), env=env)
     if kind not in ("zoo", "file"):
@@ -400,7 +404,7 @@ def _of_text(text: str, trusted: SequenceOf[str] | None) -> Agent:
     about["sha256"] = _sha256(path, "give the path of a policy")
     found = load_policy(path) if path.suffix == ".safetensors" else _archived(path, trusted or ())
     if isinstance(found, MlpPolicy):
-        return Agent(about, partial(_network, found, about["name"]), text, found.made_for)
+        return _of_network(found, about, text)
     return Agent({**about, **_library(SB3)}, partial(_model, found), text)
 
 
@@ -445,10 +449,10 @@ def _of_object(policy: Any, about: About) -> Agent:
         begin = partial(_of_world, inside, about["name"])
         return Agent({**about, "sees": "world"}, begin, policy)
     if isinstance(made, MlpPolicy):
-        about = {**about, "sha256": made.sha256}
-        return Agent(about, partial(_network, made, about["name"]), policy, made.made_for)
+        return _of_network(made, {**about, "sha256": made.sha256}, policy)
     if hasattr(made, "start") and hasattr(made, "act"):
-        return Agent(about, partial(_started, made), policy, getattr(made, "card", None))
+        how: Any = {"card": getattr(made, "card", None), "remembers": True}
+        return Agent({**about, "sees": "world"}, partial(_started, made), policy, **how)
     if not hasattr(made, "predict"):
         return Agent(about, partial(_function, made), policy)
     try:
@@ -456,6 +460,11 @@ def _of_object(policy: Any, about: About) -> Agent:
     except (AttributeError, UnknownOption):  # it has no environment of this package any more
         return Agent(about, partial(_model, made), policy)
     return Agent(about, partial(_model, made, seen=seen_through(made.get_env())), policy, card)
+
+
+def _of_network(network: MlpPolicy, about: About, policy: object) -> Agent:
+    begin, remembers = partial(_network, network, about["name"]), network.n_remembered > 0
+    return Agent(about, begin, policy, network.made_for, remembers=remembers)
 
 
 def _description(policy: object) -> About:

@@ -63,7 +63,8 @@ class Recipe(Frozen):
     Attributes:
         task: Name of the task; a file, or ``"module:function"``, for one of a model.
         algo: ``"ppo"``, ``"sac"`` or ``"td3"`` of Stable-Baselines3; ``"rsl_ppo"``: PPO of rsl-rl,
-            for thousands of worlds, whose networks, storage and updates stay on a GPU.
+            for thousands of worlds, whose networks, storage and updates stay on a GPU;
+            ``"recurrent_ppo"`` of sb3-contrib: PPO with an LSTM, of width ``network.recurrent``.
         name: ``"tuned"`` where it comes from ``recipe``.
         env: Options of the environment.
         curriculum: Interventions in it; plain data of a ``Curriculum``.
@@ -83,7 +84,7 @@ class Recipe(Frozen):
     """
 
     task: TaskName
-    algo: Literal["ppo", "sac", "td3", "rsl_ppo"] = "ppo"
+    algo: Literal["ppo", "sac", "td3", "rsl_ppo", "recurrent_ppo"] = "ppo"
     name: str = "own"
     env: dict[str, Any] = Field(default_factory=dict)
     curriculum: dict[str, Any] = Field(default_factory=PUBLISHED["0"].as_dict)
@@ -144,6 +145,10 @@ class Recipe(Frozen):
     @model_validator(mode="after")
     def _fits(self) -> Self:
         """Refuse fields that do not go together."""
+        width = self.network.recurrent
+        if (width is None) == (self.algo == "recurrent_ppo"):
+            allowed = "a width, such as 128" if width is None else "None, or algo='recurrent_ppo'"
+            raise UnknownOption(f"network.recurrent with {self.algo}", width, (allowed,))
         if isinstance(self.settings, Ppo):
             if self.algo == "rsl_ppo":
                 self._fits_rsl(self.settings)
@@ -276,7 +281,7 @@ def recipe(
             ``"module:function"`` for a function or class that gives a task. What its class has in
             ``training`` takes precedence over the usual values. Trials of a task of another
             package are in P0, A and B, as far as there are these.
-        algo: ``"ppo"``, ``"sac"``, ``"td3"`` or ``"rsl_ppo"``.
+        algo: ``"ppo"``, ``"sac"``, ``"td3"``, ``"rsl_ppo"`` or ``"recurrent_ppo"``.
         curriculum: The name of a protocol of the task, such as ``"P10"``: its variables vary
             in each episode. 0, 1 or 2 for the published ones: nothing, goals, everything; the path
             of a JSON file; or a ``Curriculum``, interventions, or plain data. The usual one of the

@@ -76,17 +76,18 @@ def scales(layout: Mapping[str, Any], space: Any, env: Mapping[str, Any]) -> Flo
         raise UnknownOption("normalize_observations with network.scaled", False, ("True",))
     found = []
     for key, part in getattr(space, "spaces", {"observation": space}).items():
-        scale = np.ones(part.shape[0])
+        scale = np.ones(int(np.prod(part.shape)))
         for name, where in layout.items() if key == "observation" else ():
-            scale[where] = SCALES.get(name.rpartition(".")[2], 1.0)
+            scale[where] = SCALES.get(name.partition("@")[0].rpartition(".")[2], 1.0)
         found.append(scale)
     return np.concatenate(found)
 
 
 def device_for(recipe: Recipe, device: str) -> str:
-    """Choose where networks are computed; those of ``"ppo"`` are too small to gain from a GPU."""
+    """Choose where networks are computed; those of PPO are too small to gain from a GPU."""
     one_of("device", device, ("auto", "cpu", "cuda"))
+    small = "ppo", "recurrent_ppo"
     has_gpu = device != "cpu" and load("torch", "torch", "train").cuda.is_available()
     if device == "cuda" and not has_gpu:
         raise UnknownOption("device", device, ("cpu: torch finds no GPU here",))
-    return "cuda" if has_gpu and (device == "cuda" or recipe.algo != "ppo") else "cpu"
+    return "cuda" if has_gpu and (device == "cuda" or recipe.algo not in small) else "cpu"

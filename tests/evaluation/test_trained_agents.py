@@ -249,8 +249,8 @@ def test_an_object_with_start_and_act_is_an_agent() -> None:
             self.episodes = 0
 
     agent = as_agent(Mine())
-    assert agent.remembers
-    assert not as_agent("still").remembers
+    assert agent.keeps
+    assert not as_agent("still").keeps
     found = small({"mine": agent, "class": Mine, "still": "still"}, "P0", task="pushing")
     assert found.about["agents"][0]["env"] == RELATIVE
     assert (
