@@ -396,6 +396,10 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
         "policy": "random", "protocols": ["P0"], "task": "pushing", "n": 1, "seeds": 0, **rest,
         "workers": 1, "engine": None, "progress": None, "repeats": None, "steps": False,
     }  # fmt: skip
+    yield evaluation.Adaptive, {
+        "policy": "random", "parameters": "mass", "measures": {"x": 0.1}, "after": 5,
+        "every": None, "iterations": 2, "last": None, "use": "mean",
+    }  # fmt: skip
     yield evaluation.in_world, {"policy": "random", "world": world}
     yield evaluation.play, {
         "env": env, "agent": agent, "plan": None, "hooks": (), "seed": 0, "episode": None,

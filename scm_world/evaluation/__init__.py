@@ -8,6 +8,7 @@ An evaluation is one call::
     found.save("results")
 """
 
+from scm_world.evaluation.adaptive import Adaptive
 from scm_world.evaluation.episodes import METRICS, Hook, in_world, play
 from scm_world.evaluation.explanation import Explanation, Otherwise, why
 from scm_world.evaluation.pipeline import evaluate
@@ -18,6 +19,7 @@ from scm_world.evaluation.statistics import Causes, Interval
 
 __all__ = [
     "METRICS",
+    "Adaptive",
     "Causes",
     "Evaluation",
     "Explanation",

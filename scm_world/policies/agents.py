@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import chain, repeat
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, cast, final
 
 import numpy as np
@@ -497,7 +498,8 @@ def _resolved(name: str, trusted: SequenceOf[str] | None) -> Any:
         problem = "is neither a policy of this package nor a function of a trusted one"
         raise ModelError([f"{name!r} {problem}; pass trusted=(…) to use it"])
     try:
-        return function.resolve()
+        found = resolve_name(name)
+        return found if hasattr(found, "act") else function.resolve()
     except (ImportError, AttributeError, ValueError) as error:
         raise ModelError([f"no function is named {name!r}: {error}"]) from None
 

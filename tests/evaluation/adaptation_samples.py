@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from scm_world import Box, StepTask
+from scm_world import Box, ModelTask, StepTask
+from scm_world.evaluation import Adaptive
 from scm_world.policies import as_agent
 from scm_world.variables import Action, Exogenous, Measured, Normal
 
@@ -75,3 +76,40 @@ AGENTS = {
     "learner": as_agent(Learner, env=FORM),
     "nothing": as_agent(nothing, env=FORM),
 }
+
+
+CART = """<mujoco><option timestep="0.01"/><worldbody><body name='cart'>
+<joint name='slider' type='slide' axis='1 0 0' damping='0.5'/><geom type='box' size='.1 .1 .1'
+mass='1'/><body name='pole'><joint name='hinge' axis='0 1 0' damping='0.05'/>
+<geom type='capsule' size='0.02' fromto='0 0 0 0 0 -0.6' mass='0.1'/></body></body></worldbody>
+<actuator><motor name='motor' joint='slider' ctrlrange='-3 3' ctrllimited='true'/></actuator>
+</mujoco>"""
+MEASURES = {"slider.position": 1e-3, "hinge.position": 1e-3}
+MASS = "pole.mass"
+
+
+class Cart(ModelTask):
+    """A pole hangs from a cart; how heavy it is varies."""
+
+    name, model, seconds, control_dt = "cart", CART, 0.8, 0.02
+    reward = (np.cos, "hinge.position")
+    observe = ("slider.position", "slider.velocity", "hinge.position", "hinge.velocity")
+    start = {"hinge.position": Box(0.2, 0.4)}  # noqa: RUF012 # read only
+    spaces = {MASS: {"a": Box(0.15, 0.4), "bounds": Box(0.02, 1.0)}}  # noqa: RUF012
+
+
+class Shaking:
+    """Shakes the cart as strongly as the pole is heavy, as far as it is told."""
+
+    def reset(self) -> None:
+        """Begin an episode."""
+        self.steps = 0
+
+    def __call__(self, observation: Any) -> Any:
+        """Push to one side, then to the other one."""
+        self.steps += 1
+        return np.array([3.0 * observation[4] * (-1.0) ** (self.steps // 5)])
+
+
+TOLD = as_agent(Shaking, env={**FORM, "include": [MASS]})
+adaptive = Adaptive(TOLD, MASS, after=15, every=10, measures=MEASURES)
