@@ -153,7 +153,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {  # each with arguments that make it sho
     "learners": ("mujoco", "60"),
     "new_family": (),
     "own_backend": ("1", "10"),
-    "own_curriculum": ("1024", "", "1"),
+    "own_curriculum": ("2048", "", "1"),
     "own_learner": (),
     "own_rl_learner": ("3",),
     "own_task": ("2",),
