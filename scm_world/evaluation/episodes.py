@@ -355,8 +355,8 @@ def in_world(policy: object, world: World) -> Policy:
     Raises:
         UnknownOption: The policy is unknown, or was trained with other options.
         SnapshotMismatch: When it acts: that world has another task or other options.
-        ActionError: When it acts: it has a memory, and this is not the control step after the last
-            one, as in a branch of an episode.
+        ActionError: When it acts: it has a memory or observes a history, and this is not the
+            control step after the last one, as in a branch of an episode.
 
     Example:
         >>> from scm_world.queries import World
@@ -376,7 +376,8 @@ def in_world(policy: object, world: World) -> Policy:
         conventions=world.options.conventions.name,
         **options,
     )
-    remembers = agent.card is not None and agent.card.memory > 0
+    history = env.history
+    remembers = agent.remembers or history is not None
     last = (-1, -1, -1)
 
     def act(now: World) -> Floats:
@@ -388,7 +389,12 @@ def in_world(policy: object, world: World) -> Policy:
             raise ActionError(f"{problem}; make one for each branch, and begin at step 0", None)
         if now.index == 0 or present[:2] != last[:2]:
             agent.start(env)
+            if history is not None:
+                history.rows[:] = 0.0
         last = present
-        return env.actions.command(agent.act(env.observe()))
+        action = agent.act(env.observe())
+        if history is not None:
+            history.push(np.zeros(1, int), env.actions.in_space(np.ravel(action)))
+        return env.actions.command(action)
 
     return act

@@ -23,6 +23,7 @@ from scm_world.queries.progress import Progress, Tell
 from scm_world.runs.files import make_folder, write_whole
 from scm_world.runs.study import Study
 from scm_world.training.export import begin_tensors
+from scm_world.training.logs import Log
 from scm_world.training.recipe import Recipe
 from scm_world.training.rounds import Rounds, restore_last
 from scm_world.training.settings import Ppo
@@ -75,7 +76,7 @@ class ManyPpo:
         self, recipe: Recipe, *, backend: str, seed: int, device: str, threads: int | None
     ) -> None:
         self.recipe, self.device, self.num_timesteps = recipe, device, 0
-        self._envs: Any = make_envs(recipe, backend=backend, threads=threads)
+        self._envs: Any = make_envs(recipe, backend=backend, threads=threads, seed=seed)
         try:
             self._build(seed)
         except BaseException:
@@ -317,6 +318,7 @@ def learn(
     progress: Progress | None,
     tell: Tell,
     begun: bool,  # whether the weights are those of a policy
+    log: Log,
 ) -> float | None:
     """Learn the remaining steps; write the curve, checkpoints, evaluations and the policy.
 
@@ -341,6 +343,7 @@ def learn(
     first = model.num_timesteps
     curve, rows = folder / (f"progress-{first}.csv" if first else "progress.csv"), []
     how: dict[str, Any] = {"backend": backend, "progress": progress, "tell": tell}
+    how["seed"] = card["seed"]
     rounds = Rounds(recipe, study, **how, save=save, policy=policy)
     rounds.begin(first)
     try:
@@ -352,7 +355,9 @@ def learn(
             rows.append({**recent, **{f"train/{n}": v for n, v in losses.items()}})
             rows[-1] |= {"time/total_timesteps": steps, "time/cpu_seconds": time.process_time()}
             means = {name.partition("/")[2]: value for name, value in recent.items()}
-            rounds.look(steps, (f"{name} {value:.3g}" for name, value in means.items()))
+            scores = rounds.look(steps, (f"{name} {value:.3g}" for name, value in means.items()))
+            rows[-1] |= {f"evaluation/{name}": value for name, value in scores.items()}
+            log(rows[-1], steps)
     finally:  # also after Ctrl-C
         if rows:
             _write(curve, rows)

@@ -63,10 +63,15 @@ class Recipe(Frozen):
     Attributes:
         task: Name of the task; a file, or ``"module:function"``, for one of a model.
         algo: ``"ppo"``, ``"sac"`` or ``"td3"`` of Stable-Baselines3; ``"rsl_ppo"``: PPO of rsl-rl,
-            for thousands of worlds, whose networks, storage and updates stay on a GPU.
+            for thousands of worlds, whose networks, storage and updates stay on a GPU;
+            ``"recurrent_ppo"`` of sb3-contrib: PPO with an LSTM, of width ``network.recurrent``.
         name: ``"tuned"`` where it comes from ``recipe``.
         env: Options of the environment.
         curriculum: Interventions in it; plain data of a ``Curriculum``.
+        levels: Train on so many draws of the curriculum and the noise: each episode is one of them,
+            drawn uniformly. Level i is episode i of the noise ``training.worlds.level_seed``.
+            Trials then have scores on these levels (the first ``trials.episodes``) and on new
+            draws, and the gap between both. None: new draws for ever.
         worlds: How many are simulated together.
         steps: Control steps of training, in all worlds together.
         settings: Settings of the algorithm.
@@ -83,10 +88,11 @@ class Recipe(Frozen):
     """
 
     task: TaskName
-    algo: Literal["ppo", "sac", "td3", "rsl_ppo"] = "ppo"
+    algo: Literal["ppo", "sac", "td3", "rsl_ppo", "recurrent_ppo"] = "ppo"
     name: str = "own"
     env: dict[str, Any] = Field(default_factory=dict)
     curriculum: dict[str, Any] = Field(default_factory=PUBLISHED["0"].as_dict)
+    levels: Count | None = None
     worlds: Count = 64
     steps: Count = 1_000_000
     settings: SerializeAsAny[Ppo | OffPolicy] = Field(default_factory=Ppo)
@@ -144,6 +150,10 @@ class Recipe(Frozen):
     @model_validator(mode="after")
     def _fits(self) -> Self:
         """Refuse fields that do not go together."""
+        width = self.network.recurrent
+        if (width is None) == (self.algo == "recurrent_ppo"):
+            allowed = "a width, such as 128" if width is None else "None, or algo='recurrent_ppo'"
+            raise UnknownOption(f"network.recurrent with {self.algo}", width, (allowed,))
         if isinstance(self.settings, Ppo):
             if self.algo == "rsl_ppo":
                 self._fits_rsl(self.settings)
@@ -162,6 +172,10 @@ class Recipe(Frozen):
                 raise UnknownOption(f"{name} with {self.algo}", True, ("none: it is of PPO",))
             if self.hindsight is not None and self.settings.n_steps > 1:
                 raise UnknownOption("n_steps with hindsight", self.settings.n_steps, ("1",))
+        parts = as_curriculum(self.curriculum).parts() if self.levels else ()
+        if any(part.kind == "stages" for part in parts):
+            none = "None: stages follow from the episodes before"
+            raise UnknownOption("levels of a curriculum with stages", self.levels, (none,))
         if self.steps < self.round:
             least = f"at least {self.round:,}: {self.worlds} worlds make so many in one round"
             raise UnknownOption("steps", self.steps, (least,))
@@ -276,7 +290,7 @@ def recipe(
             ``"module:function"`` for a function or class that gives a task. What its class has in
             ``training`` takes precedence over the usual values. Trials of a task of another
             package are in P0, A and B, as far as there are these.
-        algo: ``"ppo"``, ``"sac"``, ``"td3"`` or ``"rsl_ppo"``.
+        algo: ``"ppo"``, ``"sac"``, ``"td3"``, ``"rsl_ppo"`` or ``"recurrent_ppo"``.
         curriculum: The name of a protocol of the task, such as ``"P10"``: its variables vary
             in each episode. 0, 1 or 2 for the published ones: nothing, goals, everything; the path
             of a JSON file; or a ``Curriculum``, interventions, or plain data. The usual one of the

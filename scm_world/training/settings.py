@@ -102,9 +102,10 @@ ALGORITHMS: dict[str, type[Ppo | OffPolicy]] = {
     "sac": Sac,
     "td3": Td3,
     "rsl_ppo": Ppo,
+    "recurrent_ppo": Ppo,
 }
 """The settings of each algorithm: keyword arguments of Stable-Baselines3, by its names. The last
-one is PPO of rsl-rl, for thousands of worlds."""
+ones are PPO of rsl-rl, for thousands of worlds, and recurrent PPO of sb3-contrib."""
 
 
 @final
@@ -155,6 +156,7 @@ class Network(Frozen):
 
     Attributes:
         hidden: Widths of its hidden layers.
+        recurrent: Width of an LSTM before them, whose state lasts an episode. None: without one.
         activation: After each of them.
         log_std: Logarithm of the standard deviation with which PPO begins.
         log_std_end: Ceiling of it at the end of the training; it falls in a straight line from the
@@ -164,6 +166,7 @@ class Network(Frozen):
     """
 
     hidden: Annotated[tuple[Count, ...], Field(min_length=1)] = (256, 256)
+    recurrent: Count | None = None
     activation: Literal["tanh", "relu"] = "tanh"
     log_std: Finite = 0.0
     log_std_end: Finite | None = None

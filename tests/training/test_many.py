@@ -41,8 +41,11 @@ GIVEN: dict[str, Any] = {"backend": "fake", "threads": 1, "seed": 3}
 
 def test_a_training_writes_what_others_write(tmp_path: Path) -> None:
     """A policy that the command evaluates, curves, checkpoints; the same bits again."""
-    found = train(RECIPE, out=tmp_path / "one", **GIVEN)
+    heard: list[dict[str, float]] = []
+    found = train(RECIPE, out=tmp_path / "one", **GIVEN, callback=heard.append)
     assert found.steps == 256
+    assert [row["time/total_timesteps"] for row in heard] == [*range(32, 257, 32)]
+    assert {"rollout/ep_rew_mean", "evaluation/P0"} <= heard[-1].keys()
     assert {path.stem for path in tmp_path.glob("one/evaluations/*.json")} == {"128", "256"}
     assert found.score == max(
         json.loads(path.read_text())["mean"] for path in tmp_path.glob("one/evaluations/*.json")
