@@ -111,8 +111,8 @@ class _Twin(Hook):
         """Act once more at the control step, after the memory and the history are lost."""
         if self._env.world.index == self._step:
             self.own, self.world = np.array(action, np.float64).ravel(), self._env.world.snapshot()
-            if (history := getattr(self._env, "history", None)) is not None:
-                history.clear()
+            if self._env.history is not None:
+                self._env.history.rows[:] = 0.0
             self._agent.start(self._env)
             emptied = self._agent.act(self._env.observe())
             self.reaction = np.array(emptied, np.float64).ravel()
@@ -269,7 +269,7 @@ def _changes(arrays: Arrays, names: Sequence[str]) -> Iterator[Change]:
             one = Change(name, part, _mean(lengths), _mean(_along(signed)), chance)
             both = lengths * np.linalg.norm(other, axis=1)
             if (both > 0.0).sum() > 1:
-                cosines = ((moved * other).sum(axis=1) / both)[both > 0.0]
+                cosines = (moved * other).sum(axis=1)[both > 0.0] / both[both > 0.0]
                 by_chance = _by_chance(flips[:, : len(cosines)] * cosines)
                 one = replace(one, agreement=_mean(cosines), flipped=by_chance)
             yield one
@@ -360,7 +360,7 @@ def inferred(
             whole_number("steps", step, least=0, most=length - 1)
         probed = (*dict.fromkeys(wanted), END)
         usual = min(25, length // 4)
-        start = whole_number("at", usual if at is None else at, least=0)
+        start = whole_number("at", max(usual, 1) if at is None else at, least=0)
         later = whole_number("after", usual if after is None else after, least=0)
         pair = start, start + later
         if start:
@@ -431,7 +431,7 @@ def _played(
     return joined([found[name] for name in cells], np.concatenate)
 
 
-def _archive(arrays: Arrays) -> bytes:
+def _archive(arrays: Mapping[str, Any]) -> bytes:
     content = io.BytesIO()
-    np.savez(content, allow_pickle=False, **arrays)
+    np.savez(content, **arrays)
     return content.getvalue()

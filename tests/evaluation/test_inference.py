@@ -227,6 +227,22 @@ def test_a_memory_is_part_of_the_hidden_state(kind: str) -> None:
     assert as_agent("still").hidden() is None
 
 
+def test_the_memory_of_a_model_is_its_hidden_state() -> None:
+    """As recurrent models of Stable-Baselines3 have it: output and cell, each (layers, n, size)."""
+
+    class Model:
+        def predict(self, observation: Any, state: Any = None, **how: Any) -> Any:
+            count = 0.0 if state is None else state[0].item()
+            return np.zeros(1), (np.full((1, 1, 1), count + 1.0), np.full((1, 1, 2), -count))
+
+    agent, env = as_agent(Model()), ScmWorldEnv(Cart())
+    observation, _ = env.reset(seed=0)
+    agent.start(env)
+    for count in range(3):
+        agent.act(observation)
+        assert np.array_equal(agent.hidden(), [count + 1.0, -count, -count])
+
+
 def test_results_do_not_depend_on_workers_and_are_kept(tmp_path: Path) -> None:
     """The same numbers from two processes, from finished shards, and from a file."""
     how: Any = {"task": Cart, "n": 30, "env": HOW["env"], "out": tmp_path / "out"}
@@ -320,3 +336,27 @@ def test_probes_are_those_of_a_direct_regression() -> None:
     assert square["kernel"].value > 0.9
     assert abs(shuffled["linear"].value) < 0.05
     assert shuffled["linear"].high < 0.1
+
+
+def test_a_network_with_a_history_infers_what_its_weights_compute() -> None:
+    """One unit is the last change of velocity under a constant force, 0.05 / mass."""
+    tensors = {
+        "layers.0.weight": np.array([[1.0, -1.0, 0.0]], np.float32),  # velocity, @-1, action@-1
+        "layers.0.bias": np.zeros(1, np.float32),
+        "layers.1.weight": np.zeros((1, 1), np.float32),
+        "layers.1.bias": np.full(1, 0.5, np.float32),
+    }
+    form = {"history": 1, "normalize_observations": False}
+    policy = MlpPolicy.of(tensors, {"task": "Cart", "env": form})
+    found = inferred(policy, "mass", task=Cart(), steps=(0, 5), n=24)
+    assert [one.verdict for one in found.probes] == ["no", "inferred", "inferred"]
+    scores = found.probes[1].scores
+    assert scores["observation"]["kernel"].high < 0.5 < 0.9 < scores["hidden"]["kernel"].value
+    assert "untrained" in scores
+    assert [one.size.value for one in found.changes] == [0.0, 0.0, 0.0]
+    tensors["layers.0.weight"] = np.array([[0.0, 0.1, 0.0]], np.float32)
+    tensors["layers.1.weight"] = np.ones((1, 1), np.float32)
+    policy = MlpPolicy.of(tensors, {"task": "Cart", "env": form})
+    own, reaction, memory = inferred(policy, "mass", task=Cart(), steps=(), n=12).changes
+    assert own.size.value > 0.0 == reaction.size.value  # an emptied history has no last velocity
+    assert memory.size == own.size
