@@ -335,6 +335,14 @@ CASES: dict[str, Case] = {
         ),
         {"n": 2, "workers": 1, "steps": True},
     ),
+    "inferred": (
+        lambda **k: str(
+            evaluation.inferred(
+                "still", "*.mass", env={"max_episode_length": 4}, backend="fake", **k
+            )
+        ),
+        {"n": 2, "seed": 1, "steps": [1], "at": 1, "after": 1, "workers": 1},
+    ),
     "play": (
         lambda **k: evaluation.play(gymnasium.make(PUSHING, **SHORT), STILL, **k)[
             "fractional_success"

@@ -401,6 +401,11 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
         "every": None, "iterations": 2, "last": None, "use": "mean",
     }  # fmt: skip
     yield evaluation.in_world, {"policy": "random", "world": world}
+    yield evaluation.inferred, {
+        "policy": "still", "variables": "tool_block.mass", "task": "pushing", "steps": [0],
+        "at": 0, "after": 0, "privileged": None, "n": 1, "seed": 0, **rest, "workers": 1,
+        "engine": None, "progress": None,
+    }  # fmt: skip
     yield evaluation.play, {
         "env": env, "agent": agent, "plan": None, "hooks": (), "seed": 0, "episode": None,
         "draws": None,

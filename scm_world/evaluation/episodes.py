@@ -15,7 +15,7 @@ from scm_world._arguments import typed
 from scm_world._types import Floats, Observation
 from scm_world.curricula import CurriculumEnv
 from scm_world.env import ScmWorldEnv
-from scm_world.env.environment import unwrapped_env
+from scm_world.env.environment import FIRST, unwrapped_env
 from scm_world.env.observer import FAILED
 from scm_world.errors import (
     ActionError,
@@ -394,23 +394,26 @@ def in_world(policy: object, world: World) -> Policy:
     )
     history = env.history
     remembers = agent.remembers or history is not None
-    last = (-1, -1, -1)
+    last, action, sent = (-1, -1, -1), np.empty(0), np.empty(0)
 
     def act(now: World) -> Floats:
-        nonlocal last
-        env.world.restore(now.snapshot())
+        nonlocal last, action, sent
         present = now.noise.seed, now.episode, now.index
         if now.index > 0 and remembers and present != (*last[:2], last[2] + 1):
             problem = "a policy with a memory acts from the first control step on, in one world"
             raise ActionError(f"{problem}; make one for each branch, and begin at step 0", None)
+        if history is not None and now.index > 0:  # somebody else may have decided
+            played = now.row.actions
+            taken = action if np.array_equal(played, sent) else env.actions.toward(played)
+            history.push(FIRST, env.actions.in_space(np.ravel(taken)))
+        env.world.restore(now.snapshot())
         if now.index == 0 or present[:2] != last[:2]:
-            agent.start(env)
             if history is not None:
                 history.rows[:] = 0.0
+            agent.start(env)
         last = present
         action = agent.act(env.observe())
-        if history is not None:
-            history.push(np.zeros(1, int), env.actions.in_space(np.ravel(action)))
-        return env.actions.command(action)
+        sent = env.actions.command(action)
+        return sent
 
     return act

@@ -38,7 +38,7 @@ import numpy as np
 import safetensors.numpy
 from numpy.typing import NDArray
 
-from scm_world._arguments import true_or_false, typed
+from scm_world._arguments import true_or_false, typed, whole_number
 from scm_world._types import ArrayLike, Floats
 from scm_world.errors import ActionError, ModelError, UnknownOption, reading
 from scm_world.geometry.numbers import njit
@@ -184,11 +184,39 @@ class MlpPolicy:
             raise UnknownOption("policy", self, ("one with a value network that is not recurrent",))
         return self._computed("value.layers", self.joined(observation))
 
-    def _computed(self, name: str, seen: NDArray[Any]) -> Floats:
+    def hidden(self, observation: Observed, state: ArrayLike | None = None) -> Floats:
+        """Compute the activations of the last hidden layer, shape (..., k).
+
+        Where there is no hidden layer it is the input of the only layer.
+
+        Args:
+            observation: As above.
+            state: The memory before this observation, as in ``predict``.
+
+        Raises:
+            ActionError: As in ``predict``.
+        """
+        return self._computed("layers", self._inputs(observation, state)[0], stop=-1)
+
+    def untrained(self, seed: int = 0) -> MlpPolicy:
+        """Return a policy of equal shapes and metadata whose weights are random.
+
+        A weight is normal, with the standard deviation ``1 / sqrt(inputs)``; a bias is 0.
+        """
+        rng = np.random.default_rng(whole_number("seed", seed, least=0))
+        tensors = {
+            name: np.zeros_like(tensor)
+            if tensor.ndim == 1
+            else (rng.normal(size=tensor.shape) / math.sqrt(tensor.shape[1])).astype(np.float32)
+            for name, tensor in self.tensors().items()
+        }
+        return self.of(tensors, self.made_for)
+
+    def _computed(self, name: str, seen: NDArray[Any], stop: int | None = None) -> Floats:
         layers = self._doubles[name]
         x = np.ascontiguousarray(seen.reshape(-1, len(layers[0][0])), dtype=np.float64)
         hidden = 1 if self.about.activation == "tanh" else 2
-        for number, (weight, bias) in enumerate(layers, start=1):
+        for number, (weight, bias) in enumerate(layers[:stop], start=1):
             x = _dense(x, weight, bias, hidden if number < len(layers) else 0)
         return x.reshape(*seen.shape[:-1], x.shape[1])
 
@@ -281,6 +309,20 @@ class MlpPolicy:
             raise UnknownOption("deterministic", deterministic, ("True",))
         if not self.n_remembered:
             return self(observation), None
+        given, kept = self._inputs(observation, state, episode_start)
+        found = self._computed("layers", given)
+        if self.lstm:
+            return self._bounded(found), kept
+        action, said = np.split(found, [self.n_actions], axis=-1)
+        return self._bounded(action), np.where(said > 0.0, 1.0, -1.0).astype(np.float32)
+
+    def _inputs(
+        self,
+        observation: Observed,
+        state: ArrayLike | None = None,
+        episode_start: ArrayLike | None = None,
+    ) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return the input of the layers, and the memory, of an LSTM after this observation."""
         seen = self.joined(observation)
         shape = (*seen.shape[:-1], self.n_remembered)
         try:
@@ -295,12 +337,7 @@ class MlpPolicy:
             wanted = f"the memory has shape {shape} and {values}"
             raise ActionError(f"{wanted}, got {np.array(state)}", None)
         kept[np.broadcast_to(first, shape[:-1])] = 0.0
-        if self.lstm:
-            hidden, kept = self._recurrent(seen, kept)
-            return self._bounded(self._computed("layers", hidden)), kept
-        found = self._computed("layers", np.concatenate([seen, kept], axis=-1))
-        action, said = np.split(found, [self.n_actions], axis=-1)
-        return self._bounded(action), np.where(said > 0.0, 1.0, -1.0).astype(np.float32)
+        return self._recurrent(seen, kept) if self.lstm else (np.append(seen, kept, axis=-1), kept)
 
     def tensors(self) -> dict[str, Weights]:
         """Return the tensors of a file, by name."""

@@ -18,13 +18,14 @@ from scm_world.errors import (
     UnreadableFile,
     reading,
 )
-from scm_world.evaluation import evaluate
+from scm_world.evaluation import Protocol, evaluate
 from scm_world.policies import MlpPolicy, PolicyAbout, load_policy, save_policy
 from scm_world.policies.cards import FORM, HISTORY, KEY, OPTIONS
 from scm_world.policies.wrappers import LinearMap, samples, seen_through
 from scm_world.runs.files import read_text, write_whole
 from scm_world.training.recipe import Recipe
 from scm_world.training.settings import Trials
+from scm_world.training.worlds import level_seed
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -180,6 +181,8 @@ def _tensors(model: BaseAlgorithm) -> dict[str, Any]:
             "layers": [body.policy_net, policy.action_net],
             "value.layers": [body.value_net, policy.value_net],
         }
+        if hasattr(policy, "columns"):  # the value observes more
+            del parts["value.layers"]
     found = {}
     for name, networks in parts.items():
         linear = [m for network in networks for m in network.modules() if hasattr(m, "weight")]
@@ -207,18 +210,29 @@ def _scale(model: BaseAlgorithm) -> Any:
     """Return the factor of observations, which a policy file has in its weights."""
     owner = getattr(model.policy, "actor", model.policy)
     scale = getattr(owner.features_extractor, "scale", None)
-    return np.float32(1.0) if scale is None else scale.cpu().numpy()
+    if scale is None:
+        return np.float32(1.0)
+    return scale.cpu().numpy()[getattr(owner, "columns", slice(None))]
 
 
 def scored(
-    policy: MlpPolicy, task: str, env: Mapping[str, Any], trials: Trials, backend: str
+    policy: MlpPolicy,
+    task: str,
+    env: Mapping[str, Any],
+    trials: Trials,
+    backend: str,
+    **other: Any,
 ) -> tuple[str, dict[str, float]]:
-    """Evaluate a policy while something is trained: the metric, and its means by protocol."""
+    """Evaluate a policy while something is trained: the metric, and its means by protocol.
+
+    ``other`` are arguments of ``evaluate`` in place of those of the trials.
+    """
     form = {name: value for name, value in env.items() if name in (*OPTIONS, "task_options")}
     form["on_failure"] = env.get("on_failure", "truncate")
     protocols = list(trials.protocols)
     given: dict[str, Any] = {"task": task, "n": trials.episodes, "seeds": SEED, "env": form}
-    found = evaluate(policy, protocols, backend=backend, **given)
+    given |= {"protocols": protocols, "backend": backend, **other}
+    found = evaluate(policy, **given)
     metric = found.metric(trials.metric)
     return metric, {name: float(found.score(name, metric).value) for name in found.protocols}
 
@@ -242,8 +256,8 @@ class Evaluations:
         last: The last scores, by protocol.
     """
 
-    def __init__(self, recipe: Recipe, backend: str, folder: Path) -> None:
-        self._recipe, self._folder = recipe, folder
+    def __init__(self, recipe: Recipe, backend: str, folder: Path, seed: int) -> None:
+        self._recipe, self._folder, self._seed = recipe, folder, seed
         self._backend = recipe.trials.backend or backend
         found = [_score_in(path) for path in folder.glob("evaluations/*.json")]
         self.best: float | None = max((one for one in found if one is not None), default=None)
@@ -253,17 +267,30 @@ class Evaluations:
         """Evaluate; write the policy, also as the best one if none was better. Return the words."""
         recipe, folder = self._recipe, self._folder
         how = recipe.task, recipe.options, recipe.trials, self._backend
-        metric, self.last = scored(policy, *how)
-        score = mean(self.last)
-        found = {"steps": steps, "metric": metric, "mean": score, "scores": self.last}
+        metric, scores = scored(policy, *how)
+        score, levels = mean(scores), self._gap(policy) if recipe.levels else {}
+        self.last = {**scores, **levels}
+        found = {"steps": steps, "metric": metric, "mean": score, "scores": scores, **levels}
         save_policy(folder / "policy.safetensors", policy)
         if score is not None and (self.best is None or score > self.best):
             self.best = score
-            about = policy.about.with_card(trial={"steps": steps, "scores": self.last})
+            about = policy.about.with_card(trial={"steps": steps, "scores": scores, **levels})
             save_policy(folder / "best.safetensors", policy, about)
         path = folder / f"evaluations/{steps}.json"
         write_whole(path, json.dumps(found, indent=2))  # at last: a resumed training reads it
         return words(self.last)
+
+    def _gap(self, policy: MlpPolicy) -> dict[str, float]:
+        """Score the policy on levels of the training and on new draws of its curriculum."""
+        recipe, trials = self._recipe, self._recipe.trials
+        how = recipe.task, recipe.options, trials, self._backend
+        drawn = Protocol("curriculum", act=recipe.curriculum)
+        n = min(trials.episodes, recipe.levels or trials.episodes)
+        known: dict[str, Any] = {"seeds": level_seed(self._seed), "n": n}
+        _, old = scored(policy, *how, protocols=[drawn], **known)
+        _, new = scored(policy, *how, protocols=[drawn])
+        found = {"training_levels": old[drawn.name], "new_draws": new[drawn.name]}
+        return {**found, "gap": found["training_levels"] - found["new_draws"]}
 
 
 def _score_in(path: Path) -> float | None:

@@ -21,6 +21,8 @@ import pytest
 import safetensors.numpy
 
 from scm_world._arguments import missing
+from scm_world.curricula import CurriculumEnv, stages
+from scm_world.curricula.curriculum import as_curriculum
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import (
     ActionError,
@@ -33,14 +35,14 @@ from scm_world.errors import (
     UnreadableFile,
     UnwritableFolder,
 )
-from scm_world.evaluation import evaluate
+from scm_world.evaluation import Protocol, evaluate
 from scm_world.policies import MlpPolicy, as_agent, load_policy, save_policy
 from scm_world.runs.study import Study, settings_in
-from scm_world.training.export import begin_with
+from scm_world.training.export import SEED, begin_with
 from scm_world.training.loop import train
 from scm_world.training.recipe import Recipe, recipe
 from scm_world.training.settings import Rate
-from scm_world.training.worlds import SCALES, scales
+from scm_world.training.worlds import SCALES, level_seed, scales
 
 sb3 = pytest.importorskip("stable_baselines3")
 
@@ -231,6 +233,40 @@ def test_a_recurrent_training_resumes_and_repeats(tmp_path: Path) -> None:
         recipe("pushing", network={"recurrent": 6})
 
 
+def test_a_critic_can_observe_more_than_the_actor(tmp_path: Path) -> None:
+    """The causal parameters reach the value alone; the policy acts, resumes and starts without."""
+    changes = {"observations": "critic", "env.history": 1, "env.context": ["tool_*.mass"]}
+    made, out = RECIPES["ppo"].but(**changes, **{"network.scaled": True}), tmp_path / "run"
+    run(made, out, steps=128)
+    found = run(made, out)
+    assert found.steps == made.steps
+    policy = load_policy(found.policy)
+    assert (policy.about.option("context"), policy.value) == ("none", ())
+    with closing(algorithms.make_worlds(made, backend="fake")) as worlds:
+        model = algorithms.make_learner(made, worlds, seed=0)
+    begin_with(model, made, found.policy)
+    envs = [ScmWorldEnv("pushing", backend="fake", **o) for o in (made.options, made.trained_in)]
+    for env in envs:
+        env.reset(seed=0)
+        env.step(np.full(9, 0.3, np.float32))
+    assert envs[1].appended == ("tool_block.mass",)
+    bare, whole = (env.observe() for env in envs)
+    envs[1].do({"tool_block.mass": 0.09})
+    changed = envs[1].observe()
+    action, other = (model.predict(one, deterministic=True)[0] for one in (whole, changed))
+    np.testing.assert_allclose(policy(bare), action, atol=1e-5)
+    np.testing.assert_array_equal(action, other)
+    rows = model.policy.obs_to_tensor(np.stack([whole, changed]))[0]
+    one, two = model.policy.predict_values(rows).detach().numpy().ravel()
+    assert one != two
+    once, again = (weights(run(made, tmp_path / name).policy) for name in ("one", "two"))
+    for name, array in once.items():
+        np.testing.assert_array_equal(array, again[name], err_msg=name)
+    for algo, wrong in (("sac", {}), ("ppo", {"env": {"goal_env": True}})):
+        with pytest.raises(UnknownOption, match="critic"):
+            recipe("pushing", algo, observations="critic", **wrong)
+
+
 @pytest.mark.parametrize("name", [name for name in RECIPES if name != "recurrent"])
 @pytest.mark.parametrize("scaled", [False, True])
 def test_the_policy_file_acts_as_the_model(name: str, scaled: bool, tmp_path: Path) -> None:
@@ -383,6 +419,41 @@ def test_trackers_and_a_callback_get_the_numbers(
     monkeypatch.setitem(sys.modules, "trackio", None)
     with pytest.raises(MissingExtra, match="pip install trackio"):
         run("ppo", tmp_path / "no", log="trackio")
+
+
+def test_levels_are_a_fixed_set_of_episodes(tmp_path: Path) -> None:
+    """All worlds play them; trials have the scores on them and on new draws, and the gap."""
+    made = RECIPES["ppo"].but(levels=3, curriculum="P5", steps=128)
+    worlds = algorithms.make_worlds(made, backend="fake", seed=3)
+    worlds.seed(0)
+    met = [worlds.reset(), *(worlds.step(np.zeros((4, 9)))[0] for _ in range(80))]
+    (layout,) = worlds.get_attr("layout", 0)
+    worlds.close()
+    goals = np.stack(met)[..., layout["goal_block.cartesian_position"]].reshape(-1, 3)
+    curriculum = as_curriculum(made.curriculum)
+    with closing(ScmWorldEnv("pushing", backend="fake", **made.options)) as inside:
+        env, wanted = CurriculumEnv(inside, curriculum), []
+        for level in range(3):
+            shown, _ = env.reset(seed=level_seed(3), options={"episode": level})
+            wanted.append(shown[layout["goal_block.cartesian_position"]])
+    assert {*map(tuple, goals.tolist())} == {*map(tuple, np.array(wanted).tolist())}
+
+    found = run(made, tmp_path / "run")
+    card: Any = load_policy(found.best).about.card["trial"]
+    trial = json.loads((tmp_path / "run" / "evaluations" / f"{card['steps']}.json").read_text())
+    drawn = Protocol("drawn", act=curriculum)
+    how: Any = {"task": "pushing", "backend": "fake", "n": 1}
+    for name, seed in {"training_levels": level_seed(3), "new_draws": SEED}.items():
+        score = evaluate(found.best, drawn, seeds=seed, **how).score("drawn").value
+        assert trial[name] == card[name] == pytest.approx(score)
+    assert card["gap"] == trial["gap"] == trial["training_levels"] - trial["new_draws"]
+    assert "evaluation/gap" in (tmp_path / "run" / "progress.csv").read_text()
+    again = run(made, tmp_path / "again")
+    for name, array in weights(found.policy).items():
+        np.testing.assert_array_equal(array, weights(again.policy)[name], err_msg=name)
+    staged = stages({"floor_friction": 0.4}, {"floor_friction": 0.6}, up=0.8)
+    with pytest.raises(UnknownOption, match="levels of a curriculum with stages"):
+        recipe("pushing", levels=3, curriculum=staged)
 
 
 def test_one_training_is_not_another(tmp_path: Path) -> None:
