@@ -223,6 +223,8 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         if not len(rows):
             return
         commands = self._commanded(rows, actions)
+        for row in rows.tolist() if self._history is not None else ():
+            self._inner[row].update_history()
         indices = self._indices(rows)
         before = self._batch.by_structure(rows) if self._inner[0].truncates_failures else []
         kept = [table.numbers[members] for table, members in before]
@@ -258,17 +260,16 @@ class ScmWorldVectorEnv(SyncVectorEnv):
                 self.envs[row].get_wrapper_attr("over")(success=bool(success[row]))
 
     def _indices(self, rows: Integers) -> Integers:
-        """Return the control steps of some environments, whose histories are up to date then."""
-        inner = [self._inner[row] for row in rows.tolist()] if self._history is not None else []
-        for one in inner:
-            one.update_history()
-        return np.array([one.world.index for one in inner], dtype=int)
+        """Return the control steps of some environments with a history."""
+        found = np.zeros(self.num_envs, int)
+        for table, members in self._batch.by_structure(rows) if self._history is not None else ():
+            found[members] = table.numbers[members, table.compiled.clock]
+        return found[rows]
 
     def _remember(self, rows: Integers, indices: Integers, actions: Floats) -> None:
         """Add a pair to the histories of those environments that have taken a step since."""
         if self._history is not None:
-            now = np.array([self._inner[row].world.index for row in rows.tolist()], dtype=int)
-            which = rows[now > indices]
+            which = rows[self._indices(rows) > indices]
             self._history.push(which, self._inner[0].actions.in_space(actions[which]))
 
     def _take(self, table: Rows, rows: Integers) -> None:

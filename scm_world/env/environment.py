@@ -123,7 +123,9 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         include: Likewise, to append to the vector.
         context: Where the parameters that can be intervened on are: ``"none"``,
             ``"observation"``: appended to the vector; ``"privileged"``: in a dictionary beside
-            it. The noise of the sensors does not reach them.
+            it. Names or patterns append these only, like ``{"observation": names}``;
+            ``{"privileged": ["*.mass"]}`` has them beside it. The noise of the sensors does not
+            reach them.
         keypoints: ``"view"``: append the view of a hand of every block that has a goal, see
             ``scm_world.tasks.trifinger.views``.
         pad: Values of variables that decide which bodies exist: ``{"number_of_obstacles": 3}``. The
@@ -134,10 +136,10 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         stack_images: Whether all pictures are the channels of one, as convolutional networks (the
             ``CnnPolicy`` of Stable-Baselines3) take them.
         normalize_observations: Give numbers in [-1, 1] instead of SI units.
-        history: How many last pairs of observation and action follow the present observation, the
-            newest first: n + history * (n + n_actions) numbers, zeros where there was no step. The
-            observation of a pair is that of the instant in which the action was taken, and the
-            action is the agent's, clipped to ``action_space``.
+        history: How many last pairs of observation and action, at most 1,000, follow the present
+            observation, the newest first: n + history * (n + n_actions) numbers, zeros where there
+            was no step. The observation of a pair is that of the instant in which the action was
+            taken, and the action is the agent's, clipped to ``action_space``.
         stack_history: Give a dictionary with ``observation`` and ``history``, shape (history, n +
             n_actions), instead.
         goal_env: Give a dictionary with ``observation``, ``achieved_goal``, ``desired_goal``, as
@@ -169,6 +171,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
             ``history``: ``"joint_positions@-1"``, and ``"agent.action@-1"``, the last action.
         observed: The variables that the observation is made of; None of pictures, which show many.
         info_shapes: The shape of each entry of ``info``, without the dictionary ``reward_terms``.
+        appended: The parameters that ``context`` adds to the vector.
         actions: What actions mean.
         history: The last observations and actions; None without the option.
 
@@ -207,7 +210,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         observation_mode: str = "structured",
         observe: Iterable[str] = (),
         include: Iterable[str] = (),
-        context: str = "none",
+        context: str | Iterable[str] | Mapping[str, str | Iterable[str]] = "none",
         keypoints: str | bool = False,
         pad: Mapping[str, Any] | None = None,
         cameras: Sequence[str | Camera] | None = None,
@@ -364,7 +367,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
             self.history = observer.history
         self._declaration, self.observer = declaration, observer
         self.observation_space, self.info_shapes = observer.space, observer.info_shapes
-        self.layout = observer.layout
+        self.layout, self.appended = observer.layout, observer.appended
         self.observed = None if self._how["observation_mode"] == "pixel" else observer.names
 
     def follow(self) -> None:
@@ -411,7 +414,8 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
                 whose times lie within it. Where it
                 sets what ``start`` or a random goal sets too, it counts. ``{"episode": n}``: the
                 number of the episode within the noise; the next one if not given, 0 with a seed.
-                ``{"space": …}``: the space in which every target must lie.
+                ``{"space": …}``: the space in which every target must lie. ``{"draws": n}``: the
+                number of the episode whose draws hold, see ``World.reset``.
 
         Raises:
             UnknownOption: Another key.
@@ -427,9 +431,8 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         self._done = []
         if self.history is not None:
             self.history.rows[:] = 0.0
-        self.world.reset(
-            seed=seed, episode=0 if number is None else number, do=request, space=space
-        )
+        drawn: Any = {"space": space, "draws": asked_for.get("draws")}
+        self.world.reset(seed=seed, episode=0 if number is None else number, do=request, **drawn)
         if request:
             self._note()
         now = self._look()

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scm_world._arguments import finite_numbers, one_of, true_or_false, whole_number
-from scm_world._patterns import as_names, fitting, is_pattern
+from scm_world._patterns import as_names, fits, fitting, is_pattern
 from scm_world._types import Floats, Observation
 from scm_world.env.history import History
 from scm_world.env.pictures import Pixels
@@ -100,19 +100,45 @@ class GoalVectors:
 MODES = ("structured", "full", "pixel", "custom")
 CONTEXTS = ("none", "observation", "privileged")
 
+LONGEST = 1_000
+"""Most pairs of a history."""
+
+EVERY = ("*",)
+"""The pattern of all parameters."""
+
 FAILED = "failed"
 """What ``info`` calls an episode that ends since its world failed, with ``on_failure``."""
 
 
+def context_of(given: Any) -> tuple[str, tuple[str, ...]]:
+    """Return where the option ``context`` has parameters, and their names and patterns.
+
+    Example:
+        >>> context_of("privileged"), context_of({"privileged": "*.mass"})
+        (('privileged', ('*',)), ('privileged', ('*.mass',)))
+    """
+    if isinstance(given, str) and given in CONTEXTS:
+        return given, EVERY
+    mode, names = "observation", given
+    if isinstance(given, Mapping):
+        (mode, names) = next(iter(given.items()), ("", ()))
+    wanted = as_names(names) if isinstance(names, Iterable) else ()
+    is_text = bool(wanted) and all(isinstance(name, str) for name in wanted)
+    if not is_text or mode not in CONTEXTS[1:] or (isinstance(given, Mapping) and len(given) > 1):
+        allowed = (*CONTEXTS, "names or patterns of parameters", "{'privileged': names}")
+        raise UnknownOption("context", given, allowed)
+    return mode, wanted
+
+
 def check_options(how: Mapping[str, Any]) -> None:
     """Refuse options of an observation that do not exist, or do not go together."""
-    mode, context, keypoints = how["observation_mode"], how["context"], how["keypoints"]
+    mode, keypoints = how["observation_mode"], how["keypoints"]
     one_of("observation_mode", mode, MODES)
-    one_of("context", context, CONTEXTS)
+    context, _ = context_of(how["context"])
     flags = ("normalize_actions", "normalize_observations", "goal_env")
     for option in (*flags, "stack_images", "stack_history"):
         true_or_false(option, how[option])
-    steps = whole_number("history", how["history"], least=0)
+    steps = whole_number("history", how["history"], least=0, most=LONGEST)
     if how["stack_history"] and not steps:
         raise UnknownOption("stack_history", True, ("False without history", "True with history=k"))
     if keypoints is not False:
@@ -154,6 +180,7 @@ class Observer:
         history: Empty, with which the last pairs are observed; None without ``history``.
         observe: Given the present values of one world or of several, the observation without its
             ``history``.
+        appended: The parameters that the option ``context`` adds to the vector.
         needed: The variables that have to be computed.
         together: Whether several worlds can be observed in one call.
         outcomes: Columns of reward, end of the episode, success and fractional success; None of
@@ -179,8 +206,9 @@ class Observer:
         else:
             self._main = _vector(world, declaration, how, largest)
         self.parts: dict[str, Vector | Pixels] = {"observation": self._main}
-        if how["context"] == "privileged":
-            about = _parts(world, largest, _context(largest), sensed=False)
+        self.appended = self._main.appended if isinstance(self._main, Vector) else ()
+        if context_of(how["context"])[0] == "privileged":
+            about = _parts(world, largest, _context(largest, how), sensed=False)
             self.parts["context"] = Vector(world, declaration, about, how)
         self._shown = self.goals if how["goal_env"] else None
         self.observe: Callable[[Rows], Observation] = self._main.observe
@@ -258,10 +286,14 @@ def _check_goals(declaration: CompiledTask, goals: GoalVectors | None) -> None:
         raise UnknownOption("goal_env", True, (f"False: {allowed}",))
 
 
-def _context(declaration: CompiledTask) -> list[str]:
-    """List every parameter that an intervention can set: masses, frictions, sizes and goals."""
-    model = declaration.model
-    return [name for name in declaration.static_names if model.declared(name).settable]
+def _context(declaration: CompiledTask, how: Mapping[str, Any]) -> list[str]:
+    """List the parameters of a context: an intervention can set them."""
+    model, (_, wanted) = declaration.model, context_of(how["context"])
+    known = [name for name in declaration.static_names if model.declared(name).settable]
+    for one in wanted if wanted != EVERY else ():
+        if not any(fits(name, (one,)) for name in known):
+            raise UnknownOption("context", one, (*CONTEXTS, *known))
+    return [name for name in known if fits(name, wanted)]
 
 
 def published(world: Simulation, declaration: CompiledTask) -> dict[str, Observed]:
@@ -306,8 +338,8 @@ def _vector(
             raise UnknownOption("keypoints", how["keypoints"], allowed)
         reach = np.full(view[1], 4.0)  # [m], [rad]
         parts.append(ObservedPart(KEYPOINTS, -reach, reach))
-    if how["context"] == "observation":
-        rest = [name for name in _context(largest) if name not in names]
+    if context_of(how["context"])[0] == "observation":
+        rest = [name for name in _context(largest, how) if name not in names]
         parts += _parts(world, largest, rest, sensed=False)
     return Vector(world, declaration, parts, how, view)
 

@@ -24,7 +24,7 @@ import numpy as np
 from scm_world._arguments import typed, whole_number
 from scm_world._patterns import as_names
 from scm_world._types import Floats, Observation
-from scm_world.curricula import at_step, resample, together
+from scm_world.curricula import Situation, at_step, resample, together
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import UnknownOption
 from scm_world.evaluation.episodes import Hook, placed, play, under
@@ -52,6 +52,7 @@ from scm_world.runs.pool import Pool, pool_of
 from scm_world.runs.processes import single_threaded
 from scm_world.runs.study import Study
 from scm_world.tasks import AnySource
+from scm_world.variables import Noise
 
 STEPS = (5, 25, 100)
 FLIPS = 1000
@@ -111,8 +112,8 @@ class _Twin(Hook):
         """Act once more at the control step, after the memory and the history are lost."""
         if self._env.world.index == self._step:
             self.own, self.world = np.array(action, np.float64).ravel(), self._env.world.snapshot()
-            if (history := getattr(self._env, "history", None)) is not None:
-                history.clear()
+            if self._env.history is not None:
+                self._env.history.rows[:] = 0.0
             self._agent.start(self._env)
             emptied = self._agent.act(self._env.observe())
             self.reaction = np.array(emptied, np.float64).ravel()
@@ -269,7 +270,7 @@ def _changes(arrays: Arrays, names: Sequence[str]) -> Iterator[Change]:
             one = Change(name, part, _mean(lengths), _mean(_along(signed)), chance)
             both = lengths * np.linalg.norm(other, axis=1)
             if (both > 0.0).sum() > 1:
-                cosines = ((moved * other).sum(axis=1) / both)[both > 0.0]
+                cosines = (moved * other).sum(axis=1)[both > 0.0] / both[both > 0.0]
                 by_chance = _by_chance(flips[:, : len(cosines)] * cosines)
                 one = replace(one, agreement=_mean(cosines), flipped=by_chance)
             yield one
@@ -337,8 +338,8 @@ def inferred(
         progress: Called with how many episodes are done, and how many there are.
 
     Raises:
-        UnknownOption: An argument names something that does not exist, or nothing is drawn at the
-            reset, or steps lie beyond the episode.
+        UnknownOption: An argument names something that does not exist, nothing is drawn, or steps
+            lie beyond the episode.
         EvaluationError: As in ``evaluate``.
         InexactEngine: With twins: equal runs differ on the backend.
 
@@ -360,18 +361,18 @@ def inferred(
             whole_number("steps", step, least=0, most=length - 1)
         probed = (*dict.fromkeys(wanted), END)
         usual = min(25, length // 4)
-        start = whole_number("at", usual if at is None else at, least=0)
+        start = whole_number("at", max(usual, 1) if at is None else at, least=0)
         later = whole_number("after", usual if after is None else after, least=0)
         pair = start, start + later
         if start:
             whole_number("at + after", start + later, least=1, most=length - 1)
             here.world.require_exact("a twin of an episode", independent=True)
-        under(here, protocol.at(0)).reset(seed=seed, options={"episode": 0})
         compiled = here.world.compiled
-        acts = {n: act for _, given in here.interventions for n, act in given.items()}
+        plan = protocol.curriculum().plan(Situation(0, {}, compiled, Noise(seed), 0))
+        acts = {n: act for n, several in plan.items() for act in several if act.draws}
         names = tuple(n for n in acts if n in compiled.model and n not in compiled.actions)
         if not names:
-            allowed = ("causes that are drawn at the reset, such as '*.mass'",)
+            allowed = ("causes that are drawn, such as '*.mass'",)
             raise UnknownOption("variables", variables, allowed)
         columns, logs = [], []
         for name in names:
@@ -431,7 +432,7 @@ def _played(
     return joined([found[name] for name in cells], np.concatenate)
 
 
-def _archive(arrays: Arrays) -> bytes:
+def _archive(arrays: Mapping[str, Any]) -> bytes:
     content = io.BytesIO()
-    np.savez(content, allow_pickle=False, **arrays)
+    np.savez(content, **arrays)
     return content.getvalue()

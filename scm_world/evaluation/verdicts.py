@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any, final
 
 from scm_world.errors import reading
@@ -161,14 +160,11 @@ class Inferred:
         return "\n".join(lines).strip()
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it as plain data, in which an unknown end of an interval is None."""
-        return {
-            "format": FORMAT,
-            "about": dict(self.about),
-            "probes": [_plain(one) | {"verdict": one.verdict} for one in self.probes],
-            "changes": [_plain(one) | {"verdict": one.verdict} for one in self.changes],
-            "left_out": dict(self.left_out),
-        }
+        """Return it as plain data, with the verdicts."""
+        found: dict[str, Any] = {"format": FORMAT, **asdict(self)}
+        found["probes"] = [{**asdict(one), "verdict": one.verdict} for one in self.probes]
+        found["changes"] = [{**asdict(one), "verdict": one.verdict} for one in self.changes]
+        return found
 
     def save(self, path: Location | str) -> Location:
         """Write it as JSON, whole or not at all.
@@ -188,33 +184,15 @@ class Inferred:
             UnreadableFile: It is damaged, or something else.
         """
         with reading(path, "give a file that Inferred.save or scm-world infer has written"):
-            data = json.loads(read_text(located(path)))
-            if data["format"] != FORMAT:
+            data = json.loads(read_text(located(path)), object_hook=_read)
+            if data.pop("format") != FORMAT:
                 raise ValueError(f"it has not the format {FORMAT!r}")
-            probes, changes = (
-                [{k: v for k, v in _read(one).items() if k != "verdict"} for one in data[name]]
-                for name in ("probes", "changes")
-            )
-            return cls(
-                data["about"],
-                tuple(Probe(**one) for one in probes),
-                tuple(Change(**one) for one in changes),
-                data["left_out"],
-            )
+            made = {"probes": Probe, "changes": Change}
+            for name, kind in made.items():
+                fields = [{k: v for k, v in one.items() if k != "verdict"} for one in data[name]]
+                data[name] = tuple(kind(**one) for one in fields)
+            return cls(**data)
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, Interval):
-        return value.as_dict()
-    if isinstance(value, Probe | Change):
-        value = {name: getattr(value, name) for name in value.__dataclass_fields__}
-    return {k: _plain(v) for k, v in value.items()} if isinstance(value, Mapping) else value
-
-
-def _read(value: Any) -> Any:
-    if not isinstance(value, dict):
-        return value
-    if value.keys() == Interval.__dataclass_fields__.keys():
-        ends = {name: math.nan for name in ("low", "high") if value[name] is None}
-        return Interval(**{**value, **ends})
-    return {k: _read(v) for k, v in value.items()}
+def _read(value: dict[str, Any]) -> Any:
+    return Interval(**value) if value.keys() == Interval.__dataclass_fields__.keys() else value

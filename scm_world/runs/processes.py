@@ -9,19 +9,21 @@ import multiprocessing
 import os
 import pickle
 import signal
+import sys
 import threading
 import traceback
 import weakref
 from collections.abc import Callable, Iterator
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
+from functools import lru_cache
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from multiprocessing.reduction import ForkingPickler
 from multiprocessing.resource_tracker import ensure_running
 from typing import Any, final
 
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 from scm_world.errors import EngineFailure, UnknownOption, in_one_line
 
@@ -95,8 +97,14 @@ def _set_variables() -> Iterator[None]:
         os.environ.update(before)
 
 
+@lru_cache(maxsize=1)
+def _libraries(modules: int) -> ThreadpoolController:
+    """Find the numerical libraries, which takes milliseconds; again when modules were imported."""
+    return ThreadpoolController()
+
+
 _VARIABLES = _Shared(_set_variables)
-_LIMITS = _Shared(lambda: threadpool_limits(limits=1))
+_LIMITS = _Shared(lambda: _libraries(len(sys.modules)).limit(limits=1))
 
 
 @contextmanager

@@ -32,7 +32,7 @@ from scm_world.training.recipe import Recipe
 from scm_world.training.rounds import Rounds, restore_last
 from scm_world.training.sb3 import Sb3VecEnv
 from scm_world.training.settings import Ppo, Rate
-from scm_world.training.worlds import SEEDS, SUCCESS, make_envs, scales
+from scm_world.training.worlds import SEEDS, SUCCESS, actor_columns, make_envs, scales
 
 try:
     import stable_baselines3
@@ -42,8 +42,9 @@ try:
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.logger import KVWriter, Logger, make_output_format
     from stable_baselines3.common.noise import NormalActionNoise
+    from stable_baselines3.common.policies import ActorCriticPolicy
     from stable_baselines3.common.save_util import load_from_zip_file, recursive_setattr
-    from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+    from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, MlpExtractor
     from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 except ImportError as error:
     raise missing(error, "stable_baselines3", "stable-baselines3", "train") from error
@@ -115,6 +116,34 @@ class Scaled(BaseFeaturesExtractor):
         return observations.float() * self.scale
 
 
+@final
+class Columns(torch.nn.Module):
+    """Some of the numbers of an observation."""
+
+    def __init__(self, columns: Any) -> None:
+        super().__init__()
+        self.register_buffer("which", torch.as_tensor(columns), persistent=False)
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        """Choose them from a batch of observations."""
+        return observations[:, self.which]
+
+
+@final
+class BlindActor(ActorCriticPolicy):
+    """A policy of which the actor observes some numbers only, and the critic all."""
+
+    def __init__(self, *given: Any, columns: Any, **options: Any) -> None:
+        self.columns = columns
+        super().__init__(*given, **options)
+
+    def _build_mlp_extractor(self) -> None:
+        super()._build_mlp_extractor()
+        how = self.net_arch, self.activation_fn, self.device
+        body = MlpExtractor(len(self.columns), *how).policy_net
+        self.mlp_extractor.policy_net = torch.nn.Sequential(Columns(self.columns), *body)
+
+
 def make_learner(
     recipe: Recipe, worlds: Episodes, *, seed: int, device: str = "cpu"
 ) -> BaseAlgorithm:
@@ -150,8 +179,12 @@ def make_learner(
     if recipe.scale_rewards:
         env = VecNormalize(worlds, norm_obs=False, gamma=settings["gamma"])
     is_dict = hasattr(worlds.observation_space, "spaces")
+    networks: Any = ("MultiInput" if is_dict else "Mlp") + suffix
+    if recipe.observations == "critic":
+        (layout,), (appended,) = worlds.get_attr("layout", 0), worlds.get_attr("appended", 0)
+        networks, policy["columns"] = BlindActor, actor_columns(recipe, layout, appended)
     model = getattr(library, kind)(
-        ("MultiInput" if is_dict else "Mlp") + suffix,
+        networks,
         env,
         learning_rate=rate_of(recipe.rate),
         policy_kwargs=policy,

@@ -181,6 +181,8 @@ def _tensors(model: BaseAlgorithm) -> dict[str, Any]:
             "layers": [body.policy_net, policy.action_net],
             "value.layers": [body.value_net, policy.value_net],
         }
+        if hasattr(policy, "columns"):  # the value observes more
+            del parts["value.layers"]
     found = {}
     for name, networks in parts.items():
         linear = [m for network in networks for m in network.modules() if hasattr(m, "weight")]
@@ -208,7 +210,9 @@ def _scale(model: BaseAlgorithm) -> Any:
     """Return the factor of observations, which a policy file has in its weights."""
     owner = getattr(model.policy, "actor", model.policy)
     scale = getattr(owner.features_extractor, "scale", None)
-    return np.float32(1.0) if scale is None else scale.cpu().numpy()
+    if scale is None:
+        return np.float32(1.0)
+    return scale.cpu().numpy()[getattr(owner, "columns", slice(None))]
 
 
 def scored(

@@ -20,7 +20,7 @@ from scm_world._arguments import load, one_of, whole_number
 from scm_world._fingerprint import fingerprint
 from scm_world._types import Floats, Observation
 from scm_world.env import ScmWorldEnv
-from scm_world.env.observer import FAILED
+from scm_world.env.observer import FAILED, context_of
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation.episodes import Hook, in_world, play, under
 from scm_world.evaluation.protocols import chosen, protocols_of
@@ -160,7 +160,8 @@ class Lesson(Frozen):
     def _of_a_policy(cls, env: dict[str, Any]) -> dict[str, Any]:
         for name, value in env.items():
             one_of("option of the environment of a lesson", name, OPTIONS)
-            if value not in (allowed := ONLY.get(name, (value,))):
+            kind = context_of(value)[0] if name == "context" else value
+            if kind not in (allowed := ONLY.get(name, (kind,))):
                 raise UnknownOption(
                     f"{name} of a lesson", value, [json.dumps(one) for one in allowed]
                 )

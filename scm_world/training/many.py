@@ -27,7 +27,7 @@ from scm_world.training.logs import Log
 from scm_world.training.recipe import Recipe
 from scm_world.training.rounds import Rounds, restore_last
 from scm_world.training.settings import Ppo
-from scm_world.training.worlds import SEEDS, SUCCESS, make_envs, scales
+from scm_world.training.worlds import SEEDS, SUCCESS, actor_columns, make_envs, scales
 
 try:
     import torch
@@ -40,6 +40,9 @@ except ImportError as error:
 
 SEEN = "seen"
 """The group of observations."""
+
+ALL = "all"
+"""The group of observations of a critic that observes more."""
 
 BOUND = 10.0
 """Largest size of a scaled reward."""
@@ -94,14 +97,18 @@ class ManyPpo:
         (self.world, *_) = envs.get_attr("world")
         (self._length, *_) = envs.get_attr("limit")
         (layout, *_) = envs.get_attr("layout")
-        scale = scales(layout, space, recipe.options) if recipe.network.scaled else np.ones(1)
-        self.scale = np.asarray(scale, np.float32)
-        self._scale = torch.as_tensor(self.scale, device=self.device)
+        (appended, *_) = envs.get_attr("appended")
+        scale = np.ones(space.shape)
+        if recipe.network.scaled:
+            scale = scales(layout, space, recipe.options)
+        self._columns = actor_columns(recipe, layout, appended)
+        self.scale = np.asarray(scale, np.float32)[self._columns]
+        self._scale = torch.as_tensor(scale, dtype=torch.float32, device=self.device)
         self._seed = (seed + 1) * SEEDS
         torch.manual_seed(seed)
         n, n_actions = recipe.worlds, envs.single_action_space.shape[0]
         first = self._seen(np.zeros((n, *space.shape), np.float32))
-        groups = {name: [SEEN] for name in ("actor", "critic")}
+        groups = {"actor": [SEEN], "critic": [ALL if recipe.observations == "critic" else SEEN]}
         network = recipe.network
         shape: dict[str, Any] = {"hidden_dims": [*network.hidden], "activation": network.activation}
         normal = {
@@ -150,7 +157,10 @@ class ManyPpo:
 
     def _seen(self, observation: Any) -> TensorDict:
         rows = torch.as_tensor(observation, device=self.device) * self._scale
-        return TensorDict({SEEN: rows}, batch_size=[len(rows)], device=self.device)
+        seen = {SEEN: rows}
+        if self.recipe.observations == "critic":
+            seen = {SEEN: rows[:, self._columns], ALL: rows}
+        return TensorDict(seen, batch_size=[len(rows)], device=self.device)
 
     def _begin(self) -> TensorDict:
         """Begin all episodes; staggered, world i of n begins i / n of an episode later."""
@@ -265,6 +275,8 @@ class ManyPpo:
     def policy(self, card: Mapping[str, Any]) -> MlpPolicy:
         """Return the policy, without torch."""
         tensors = {name: one.detach().cpu().numpy().copy() for name, one in self.tensors().items()}
+        if self.recipe.observations == "critic":  # the value observes more
+            tensors = {name: one for name, one in tensors.items() if not name.startswith("value")}
         for name in tensors:
             if name.endswith("layers.0.weight"):
                 tensors[name] *= self.scale
@@ -304,8 +316,9 @@ def opened(
 
 def begin_with(model: ManyPpo, recipe: Recipe, start: Path | str) -> None:
     """Initialise policy and value with the weights of a policy file."""
-    tensors = model.tensors()
-    begin_tensors(load_policy(start), model.policy({}), start, tensors, model.scale)
+    mine = model.policy({})
+    tensors = {name: one for name, one in model.tensors().items() if name in mine.tensors()}
+    begin_tensors(load_policy(start), mine, start, tensors, model.scale)
 
 
 def learn(

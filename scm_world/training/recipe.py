@@ -83,7 +83,9 @@ class Recipe(Frozen):
         staggered: Begin the worlds at different steps of their episodes.
         critic_warmup: Control steps in which PPO learns the value only.
         hindsight: Hindsight experience replay, with sparse rewards, if given (SAC and TD3).
-        observations: ``"plain"``, or ``"privileged"``: with every causal parameter.
+        observations: ``"plain"``; ``"privileged"``: with every causal parameter, or those that
+            ``env["context"]`` names; ``"critic"`` (PPO): with these for the value alone, which
+            policy files do not have.
         trials: Evaluations while it is trained.
     """
 
@@ -103,7 +105,7 @@ class Recipe(Frozen):
     staggered: bool = True
     critic_warmup: Annotated[int, Field(ge=0)] = 0
     hindsight: Hindsight | None = None
-    observations: Observations = "plain"
+    observations: Observations | Literal["critic"] = "plain"
     trials: Trials = Field(default_factory=Trials)
 
     @field_validator("env")
@@ -154,6 +156,14 @@ class Recipe(Frozen):
         if (width is None) == (self.algo == "recurrent_ppo"):
             allowed = "a width, such as 128" if width is None else "None, or algo='recurrent_ppo'"
             raise UnknownOption(f"network.recurrent with {self.algo}", width, (allowed,))
+        if self.observations == "critic":
+            if self.algo not in ("ppo", "rsl_ppo"):
+                known = ("'plain'", "'privileged'", "algo='ppo' or 'rsl_ppo'")
+                raise UnknownOption(f"observations with {self.algo}", "critic", known)
+            for name in ("goal_env", "stack_history"):
+                if self.env.get(name):
+                    said = "False: the observation is one vector"
+                    raise UnknownOption(f"{name} with observations='critic'", True, (said,))
         if isinstance(self.settings, Ppo):
             if self.algo == "rsl_ppo":
                 self._fits_rsl(self.settings)
@@ -226,6 +236,8 @@ class Recipe(Frozen):
     def options(self) -> dict[str, Any]:
         """Options of the environment, with all that follows from the other fields."""
         found = observed(self.env, self.observations)
+        if self.observations == "critic":
+            found["context"] = "none"
         if self.hindsight is not None:
             given = found.get("task_options") or {}
             kept = {name: value for name, value in given.items() if name not in REWARDS}
@@ -235,9 +247,11 @@ class Recipe(Frozen):
     @property
     def trained_in(self) -> dict[str, Any]:
         """Options of the environment while the agent is trained."""
-        if self.episode_length is None:
-            return self.options
-        return {**self.options, "max_episode_length": self.episode_length}
+        found = {**self.options}
+        if self.observations == "critic":
+            found |= {"context": observed(self.env, "critic")["context"]}
+        length = self.episode_length
+        return found if length is None else {**found, "max_episode_length": length}
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as plain data."""

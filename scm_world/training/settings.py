@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar, final
 from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
 
 from scm_world._arguments import load, one_of, plain
+from scm_world.env.observer import EVERY, context_of
 from scm_world.errors import ScmWorldError, UnknownOption
 from scm_world.evaluation.episodes import METRICS
 from scm_world.tasks import TASKS, Task, tasks
@@ -32,7 +33,7 @@ Share = Annotated[float, Field(ge=0.0, le=1.0)]
 NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Observations = Literal["plain", "privileged"]
-"""What a policy observes: its task, or also every causal parameter."""
+"""What a policy observes: its task, or also the causal parameters."""
 
 
 Made = TypeVar("Made", bound=Frozen)
@@ -204,14 +205,19 @@ class Trials(Frozen):
     metric: Metric | None = None
 
 
-def observed(env: Mapping[str, Any], observations: Observations) -> dict[str, Any]:
-    """Return options of an environment with the observations that a policy gets.
+def observed(env: Mapping[str, Any], observations: str) -> dict[str, Any]:
+    """Return options of an environment with the observations that a policy or its critic gets.
+
+    All parameters are observed, or those of ``env["context"]``.
 
     Example:
         >>> observed({"frame_skip": 5}, "privileged")
         {'frame_skip': 5, 'context': 'observation'}
     """
-    return {**env, "context": "observation"} if observations == "privileged" else dict(env)
+    if observations == "plain":
+        return dict(env)
+    _, names = context_of(env.get("context", "none"))
+    return {**env, "context": "observation" if names == EVERY else {"observation": [*names]}}
 
 
 def built(

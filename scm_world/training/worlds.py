@@ -91,6 +91,24 @@ def scales(layout: Mapping[str, Any], space: Any, env: Mapping[str, Any]) -> Flo
     return np.concatenate(found)
 
 
+def actor_columns(recipe: Recipe, layout: Mapping[str, Any], appended: Any) -> Any:
+    """Return the numbers of a vector that an actor observes: not what the critic alone does.
+
+    Args:
+        recipe: How it is trained.
+        layout: Where each variable is in the vector.
+        appended: The names of the parameters among them that were added for the critic.
+
+    Returns:
+        Shape (n,); ``slice(None)`` where it observes the same as the critic.
+    """
+    if recipe.observations != "critic":
+        return slice(None)
+    hidden = {*appended}
+    there = [at for name, at in layout.items() if name.partition("@")[0] not in hidden]
+    return np.concatenate([np.arange(at.start, at.stop) for at in there])
+
+
 def device_for(recipe: Recipe, device: str) -> str:
     """Choose where networks are computed; those of PPO are too small to gain from a GPU."""
     one_of("device", device, ("auto", "cpu", "cuda"))

@@ -293,6 +293,11 @@ def test_a_policy_with_a_history_acts_in_a_world() -> None:
         world.step(acting(world))
         env.step(policy(env.observe()))
         np.testing.assert_array_equal(world.vector, env.world.vector)
+    acting(world)
+    world.step(env.actions.command(np.full(9, 0.5)))  # somebody else decides
+    env.step(np.full(9, 0.5))
+    wanted = env.actions.command(policy(env.observe()))
+    np.testing.assert_allclose(acting(world), wanted, rtol=1e-6)
 
 
 REFUSED: list[tuple[dict[str, Any], str]] = [

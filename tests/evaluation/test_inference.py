@@ -15,7 +15,7 @@ from scm_world import Action, Box, Exogenous, Measured, StepTask
 from scm_world.cli.app import app
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import ScmWorldError, UnreadableFile
-from scm_world.evaluation import Inferred, evaluate, inferred
+from scm_world.evaluation import Inferred, Protocol, evaluate, inferred
 from scm_world.evaluation.statistics.probes import probe
 from scm_world.policies import MlpPolicy, WorldPolicy, as_agent
 from scm_world.variables import Continuous
@@ -101,7 +101,6 @@ def learner() -> Inferred:
 
 def masses(episodes: Any) -> np.ndarray:
     """Return the masses that the protocol draws."""
-    from scm_world.evaluation import Protocol
     from scm_world.evaluation.episodes import under
 
     env = ScmWorldEnv(Cart())
@@ -158,6 +157,14 @@ def test_a_policy_of_the_world_reacts_without_memory() -> None:
     assert found.about["twins"] == [3, 5]
 
 
+def test_a_cause_may_be_drawn_within_episodes() -> None:
+    """Before, it has its default, about which there is nothing to infer."""
+    late = Protocol("late", "mass", step=4)
+    found = inferred(Learner(), late, task=Cart(), steps=(2,), at=0, **HOW)
+    assert found.left_out["mass at step 2"] == "it was 1 in every episode"
+    assert [(one.step, one.verdict) for one in found.probes] == [(-1, "inferred")]
+
+
 def test_without_memory_nothing_is_inferred_and_what_is_seen_is_not() -> None:
     """The mass is not in the velocity; where a scale shows it, the observation is the reason."""
     found = inferred(Blind(), "mass", task=Cart(), at=0, **HOW)
@@ -191,6 +198,7 @@ def test_networks_have_an_untrained_control() -> None:
     assert not np.array_equal(other.hidden(seen), policy.hidden(seen))
     assert np.array_equal(other.hidden(seen), policy.untrained(3).hidden(seen))
     found = inferred(policy, "mass", task=Weighed(), at=0, n=24, env=FROM_REST)
+    assert {one.variable for one in found.probes} == {"mass"}  # not what the environment sets
     scores = found.probes[-1].scores
     assert scores["untrained"]["kernel"].value > 0.9
     assert found.verdicts()["mass"].startswith("no")
@@ -225,6 +233,22 @@ def test_a_memory_is_part_of_the_hidden_state(kind: str) -> None:
         assert np.allclose(agent.hidden(), [*layer, *state], rtol=1e-6)
         observation = env.step(action)[0]
     assert as_agent("still").hidden() is None
+
+
+def test_the_memory_of_a_model_is_its_hidden_state() -> None:
+    """As recurrent models of Stable-Baselines3 have it: output and cell, each (layers, n, size)."""
+
+    class Model:
+        def predict(self, observation: Any, state: Any = None, **how: Any) -> Any:
+            count = 0.0 if state is None else state[0].item()
+            return np.zeros(1), (np.full((1, 1, 1), count + 1.0), np.full((1, 1, 2), -count))
+
+    agent, env = as_agent(Model()), ScmWorldEnv(Cart())
+    observation, _ = env.reset(seed=0)
+    agent.start(env)
+    for count in range(3):
+        agent.act(observation)
+        assert np.array_equal(agent.hidden(), [count + 1.0, -count, -count])
 
 
 def test_results_do_not_depend_on_workers_and_are_kept(tmp_path: Path) -> None:
@@ -320,3 +344,27 @@ def test_probes_are_those_of_a_direct_regression() -> None:
     assert square["kernel"].value > 0.9
     assert abs(shuffled["linear"].value) < 0.05
     assert shuffled["linear"].high < 0.1
+
+
+def test_a_network_with_a_history_infers_what_its_weights_compute() -> None:
+    """One unit is the last change of velocity under a constant force, 0.05 / mass."""
+    tensors = {
+        "layers.0.weight": np.array([[1.0, -1.0, 0.0]], np.float32),  # velocity, @-1, action@-1
+        "layers.0.bias": np.zeros(1, np.float32),
+        "layers.1.weight": np.zeros((1, 1), np.float32),
+        "layers.1.bias": np.full(1, 0.5, np.float32),
+    }
+    form = {"history": 1, "normalize_observations": False}
+    policy = MlpPolicy.of(tensors, {"task": "Cart", "env": form})
+    found = inferred(policy, "mass", task=Cart(), steps=(0, 5), n=24)
+    assert [one.verdict for one in found.probes] == ["no", "inferred", "inferred"]
+    scores = found.probes[1].scores
+    assert scores["observation"]["kernel"].high < 0.5 < 0.9 < scores["hidden"]["kernel"].value
+    assert "untrained" in scores
+    assert [one.size.value for one in found.changes] == [0.0, 0.0, 0.0]
+    tensors["layers.0.weight"] = np.array([[0.0, 0.1, 0.0]], np.float32)
+    tensors["layers.1.weight"] = np.ones((1, 1), np.float32)
+    policy = MlpPolicy.of(tensors, {"task": "Cart", "env": form})
+    own, reaction, memory = inferred(policy, "mass", task=Cart(), steps=(), n=12).changes
+    assert own.size.value > 0.0 == reaction.size.value  # an emptied history has no last velocity
+    assert memory.size == own.size

@@ -233,6 +233,40 @@ def test_a_recurrent_training_resumes_and_repeats(tmp_path: Path) -> None:
         recipe("pushing", network={"recurrent": 6})
 
 
+def test_a_critic_can_observe_more_than_the_actor(tmp_path: Path) -> None:
+    """The causal parameters reach the value alone; the policy acts, resumes and starts without."""
+    changes = {"observations": "critic", "env.history": 1, "env.context": ["tool_*.mass"]}
+    made, out = RECIPES["ppo"].but(**changes, **{"network.scaled": True}), tmp_path / "run"
+    run(made, out, steps=128)
+    found = run(made, out)
+    assert found.steps == made.steps
+    policy = load_policy(found.policy)
+    assert (policy.about.option("context"), policy.value) == ("none", ())
+    with closing(algorithms.make_worlds(made, backend="fake")) as worlds:
+        model = algorithms.make_learner(made, worlds, seed=0)
+    begin_with(model, made, found.policy)
+    envs = [ScmWorldEnv("pushing", backend="fake", **o) for o in (made.options, made.trained_in)]
+    for env in envs:
+        env.reset(seed=0)
+        env.step(np.full(9, 0.3, np.float32))
+    assert envs[1].appended == ("tool_block.mass",)
+    bare, whole = (env.observe() for env in envs)
+    envs[1].do({"tool_block.mass": 0.09})
+    changed = envs[1].observe()
+    action, other = (model.predict(one, deterministic=True)[0] for one in (whole, changed))
+    np.testing.assert_allclose(policy(bare), action, atol=1e-5)
+    np.testing.assert_array_equal(action, other)
+    rows = model.policy.obs_to_tensor(np.stack([whole, changed]))[0]
+    one, two = model.policy.predict_values(rows).detach().numpy().ravel()
+    assert one != two
+    once, again = (weights(run(made, tmp_path / name).policy) for name in ("one", "two"))
+    for name, array in once.items():
+        np.testing.assert_array_equal(array, again[name], err_msg=name)
+    for algo, wrong in (("sac", {}), ("ppo", {"env": {"goal_env": True}})):
+        with pytest.raises(UnknownOption, match="critic"):
+            recipe("pushing", algo, observations="critic", **wrong)
+
+
 @pytest.mark.parametrize("name", [name for name in RECIPES if name != "recurrent"])
 @pytest.mark.parametrize("scaled", [False, True])
 def test_the_policy_file_acts_as_the_model(name: str, scaled: bool, tmp_path: Path) -> None:
