@@ -284,6 +284,7 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
         "observation_mode": "structured", "observe": (), "include": (), "context": "none",
         "keypoints": False, "pad": None, "cameras": None, "image_size": None,
         "stack_images": False, "normalize_observations": True, "goal_env": False, "start": None,
+        "history": 1, "stack_history": False,
         "random_goal": None, "variables_space": None, "max_episode_length": 2,
         "max_episode_steps": None, "on_failure": "raise", "conventions": "scm_world",
         "render_mode": None, "render_camera": None, "render_size": None,
@@ -396,6 +397,11 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
         "workers": 1, "engine": None, "progress": None,
     }  # fmt: skip
     yield evaluation.in_world, {"policy": "random", "world": world}
+    yield evaluation.inferred, {
+        "policy": "still", "variables": "tool_block.mass", "task": "pushing", "steps": [0],
+        "at": 0, "after": 0, "privileged": None, "n": 1, "seed": 0, **rest, "workers": 1,
+        "engine": None, "progress": None,
+    }  # fmt: skip
     yield evaluation.play, {
         "env": env, "agent": agent, "plan": None, "hooks": (), "seed": 0, "episode": None
     }  # fmt: skip

@@ -130,6 +130,7 @@ class Vector:
     Attributes:
         names: The variables that have to be computed.
         layout: Where each part stands.
+        appended: The parts that the noise of the sensors does not reach: parameters.
         space: In which the observation lies.
         together: Whether several worlds can be observed in one call.
     """
@@ -146,6 +147,7 @@ class Vector:
         sizes = [part.low.size for part in parts]
         ends = zip(parts, np.cumsum(sizes).tolist(), strict=True)
         self.layout = {part.name: slice(end - part.low.size, end) for part, end in ends}
+        self.appended = tuple(part.name for part in parts if not part.sensed)
         where, options = declaration.where, world.options
         self.names = tuple(part.name for part in parts if part.name in where)
         self.names += () if view is None else view[0]

@@ -15,7 +15,7 @@ from scm_world._arguments import typed
 from scm_world._types import Floats, Observation
 from scm_world.curricula import CurriculumEnv
 from scm_world.env import ScmWorldEnv
-from scm_world.env.environment import unwrapped_env
+from scm_world.env.environment import FIRST, unwrapped_env
 from scm_world.env.observer import FAILED
 from scm_world.errors import (
     ActionError,
@@ -355,8 +355,8 @@ def in_world(policy: object, world: World) -> Policy:
     Raises:
         UnknownOption: The policy is unknown, or was trained with other options.
         SnapshotMismatch: When it acts: that world has another task or other options.
-        ActionError: When it acts: it has a memory, and this is not the control step after the last
-            one, as in a branch of an episode.
+        ActionError: When it acts: it has a memory or observes a history, and this is not the
+            control step after the last one, as in a branch of an episode.
 
     Example:
         >>> from scm_world.queries import World
@@ -376,19 +376,28 @@ def in_world(policy: object, world: World) -> Policy:
         conventions=world.options.conventions.name,
         **options,
     )
-    remembers = agent.card is not None and agent.card.memory > 0
-    last = (-1, -1, -1)
+    history = env.history
+    remembers = agent.remembers or history is not None
+    last, action, sent = (-1, -1, -1), np.empty(0), np.empty(0)
 
     def act(now: World) -> Floats:
-        nonlocal last
-        env.world.restore(now.snapshot())
+        nonlocal last, action, sent
         present = now.noise.seed, now.episode, now.index
         if now.index > 0 and remembers and present != (*last[:2], last[2] + 1):
             problem = "a policy with a memory acts from the first control step on, in one world"
             raise ActionError(f"{problem}; make one for each branch, and begin at step 0", None)
+        if history is not None and now.index > 0:  # somebody else may have decided
+            played = now.row.actions
+            taken = action if np.array_equal(played, sent) else env.actions.toward(played)
+            history.push(FIRST, env.actions.in_space(np.ravel(taken)))
+        env.world.restore(now.snapshot())
         if now.index == 0 or present[:2] != last[:2]:
+            if history is not None:
+                history.rows[:] = 0.0
             agent.start(env)
         last = present
-        return env.actions.command(agent.act(env.observe()))
+        action = agent.act(env.observe())
+        sent = env.actions.command(action)
+        return sent
 
     return act

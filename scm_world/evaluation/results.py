@@ -24,6 +24,7 @@ from scm_world.evaluation.statistics import (
     find_causes,
     mean_interval,
 )
+from scm_world.evaluation.verdicts import Inferred
 from scm_world.runs.files import (
     Location,
     located,
@@ -290,6 +291,7 @@ class Evaluation:
         *,
         agent: str | None = None,
         engine: str | None = None,
+        inferred: Inferred | None = None,
     ) -> Causes:
         """Estimate the effect of each variable that varies in a protocol on the score.
 
@@ -298,6 +300,9 @@ class Evaluation:
         Variables without a directed path to the score or to the observation are left out. Of
         several runs of an agent the mean counts. This measures how sensitive the score is; which
         parameter accounts for the deviation of a recording is ``World.explain``.
+
+        With ``inferred``, what the function of this name has found for the agent, the table says
+        which variables the agent infers, and which of those that matter it does not.
         """
         metric = self.metric(metric)
         agent, engine = self.the("agent", agent), self.the("engine", engine)
@@ -309,7 +314,9 @@ class Evaluation:
         silent = [n for n in self.about.get("unrelated", {}).get(agent, ()) if n in varied]
         tested = {name: values for name, values in varied.items() if name not in silent}
         found = find_causes(tested, scores, proportion=RATES[metric])
-        return replace(found, left_out={**found.left_out, **dict.fromkeys(silent, NO_PATH)})
+        left_out = {**found.left_out, **dict.fromkeys(silent, NO_PATH)}
+        verdicts = {} if inferred is None else inferred.verdicts()
+        return replace(found, left_out=left_out, verdicts=verdicts)
 
     # --- files --------------------------------------------------------------------------------
 

@@ -105,6 +105,8 @@ class Agent:
         begin: Returns the actor of the episode that an environment has begun.
         policy: What ``as_agent`` was given.
         card: What the policy was trained for, if known.
+        network: What computes the actions, if it is not the world that is read.
+        remembers: Whether its actions follow from earlier control steps of the episode, too.
     """
 
     @typed
@@ -114,12 +116,17 @@ class Agent:
         begin: Callable[[PolicyEnv], Actor],
         policy: object = None,
         card: PolicyAbout | None = None,
+        network: object = None,
+        *,
+        remembers: bool = False,
     ) -> None:
         self.about: About = dict(about)
-        self.policy, self.card = policy, card
+        self.policy, self.card, self.network = policy, card, network
+        self.remembers = remembers
         self._begin = begin
         self._env: PolicyEnv | None = None
         self._act: Actor | None = None
+        self._seen: Observation | None = None
 
     def start(self, env: PolicyEnv) -> None:
         """Begin an episode; called after every reset.
@@ -133,7 +140,7 @@ class Agent:
             FunctionFailure: The policy raised an error.
         """
         with blamed(f"the policy {self.about['name']!r}"):
-            self._env, self._act = env, self._begin(env)
+            self._env, self._act, self._seen = env, self._begin(env), None
 
     def act(self, observation: Observation) -> Actions:
         """Choose an action of the environment, shape (n_actions,).
@@ -148,13 +155,39 @@ class Agent:
         name = self.about["name"]
         if self._act is None:
             raise ActionError(f"the policy {name!r} acts in no episode; call start()", None)
+        self._seen = observation
         with blamed(f"the policy {name!r}"):
             action = self._act(observation)
         return checked(action, self._env, name)
 
+    def hidden(self) -> Floats | None:
+        """Return the hidden state with which the last action was chosen, shape (k,).
+
+        Of a network it is the activations of the last hidden layer, and the memory after the
+        action; of a recurrent model without such a method the memory; of any other object what its
+        method ``hidden`` returns for the observation.
+
+        Returns:
+            The numbers; None of a policy without a hidden state, or before the first action.
+
+        Raises:
+            FunctionFailure: The method of the policy raised an error.
+        """
+        ask = getattr(self._act, "hidden", None)
+        if not callable(ask) or self._seen is None:
+            return None
+        with blamed(f"the policy {self.about['name']!r}"):
+            found = ask(self._seen)
+            return None if found is None else np.array(found, dtype=np.float64).ravel()
+
+    def untrained(self, seed: int = 0) -> Agent | None:
+        """Return the agent with the same network of random weights; None without a network."""
+        make = getattr(self.network, "untrained", None)
+        return None if make is None else as_agent(make(seed))
+
     def __getstate__(self) -> dict[str, Any]:
         """Copy and pickle without the episode."""
-        return {**vars(self), "_env": None, "_act": None}
+        return {**vars(self), "_env": None, "_act": None, "_seen": None}
 
 
 def checked(action: object, env: PolicyEnv | None, name: str) -> Actions:
@@ -204,23 +237,41 @@ def _function(policy: Any, env: PolicyEnv) -> Actor:
 
 
 def _model(model: Any, env: PolicyEnv, seen: LinearMap | None = None) -> Actor:
-    """Carry the state of a recurrent model from step to step, which observes through wrappers."""
+    """Begin an episode of a model with ``predict``, which observes through wrappers."""
     shapes = [_shapes(getattr(one, "observation_space", None)) for one in (model, env)]
     if seen is None and shapes[0] not in (None, shapes[1]):
         problem = f"it observes shape {shapes[0]}, and the environment shows {shapes[1]}"
         raise ActionError(f"{problem}; give the options of its training: env={{…}}", None)
-    state, first = None, True
+    return _Recurrent(model, seen)
 
-    def act(observation: Observation) -> object:
-        nonlocal state, first
-        shown: object = observation if seen is None else seen(cast("ArrayLike", observation))
-        action, state = model.predict(
-            shown, state=state, episode_start=np.array([first]), deterministic=True
+
+@final
+class _Recurrent:
+    """Acts by a model with ``predict``, and carries its state from step to step."""
+
+    def __init__(self, model: Any, seen: LinearMap | None) -> None:
+        self._model, self._seen = model, seen
+        self._before: Any = None
+        self._state: Any = None
+        self._first = True
+
+    def __call__(self, observation: Observation) -> object:
+        self._before, first = self._state, np.array([self._first])
+        action, self._state = self._model.predict(
+            self._shown(observation), state=self._before, episode_start=first, deterministic=True
         )
-        first = False
+        self._first = False
         return action
 
-    return act
+    def hidden(self, observation: Observation) -> Floats | None:
+        """Return the hidden state of the last action, which followed from this observation."""
+        ask, state = getattr(self._model, "hidden", None), self._state
+        parts = [ask(self._shown(observation), self._before)] if callable(ask) else []
+        parts += [] if state is None else state if isinstance(state, tuple) else [state]
+        return np.concatenate([*map(np.ravel, parts)]) if parts else None
+
+    def _shown(self, observation: Observation) -> object:
+        return observation if self._seen is None else self._seen(cast("ArrayLike", observation))
 
 
 def _shapes(space: object) -> object:
@@ -236,7 +287,7 @@ def _network(policy: MlpPolicy, name: str, env: PolicyEnv) -> Actor:
     if policy.made_for is not None:
         policy.made_for.check(env, name)
     policy.check(env.observe(), env.world.compiled.n_actions)
-    return _model(policy, env) if policy.about.memory else policy
+    return _model(policy, env) if policy.n_remembered else policy
 
 
 def _of_world(given: str | Policy, name: str, env: PolicyEnv) -> Actor:
@@ -344,7 +395,7 @@ def _of_text(text: str, trusted: SequenceOf[str] | None) -> Agent:
     about["sha256"] = _sha256(path, "give the path of a policy")
     found = load_policy(path) if path.suffix == ".safetensors" else _archived(path, trusted or ())
     if isinstance(found, MlpPolicy):
-        return Agent(about, partial(_network, found, about["name"]), text, found.made_for)
+        return _of_network(found, about, text)
     return Agent({**about, **_library(SB3)}, partial(_model, found), text)
 
 
@@ -388,15 +439,20 @@ def _of_object(policy: Any, about: About) -> Agent:
         begin = partial(_of_world, inside, about["name"])
         return Agent({**about, "sees": "world"}, begin, policy)
     if isinstance(made, MlpPolicy):
-        about = {**about, "sha256": made.sha256}
-        return Agent(about, partial(_network, made, about["name"]), policy, made.made_for)
+        return _of_network(made, {**about, "sha256": made.sha256}, policy)
     if not hasattr(made, "predict"):
-        return Agent(about, partial(_function, made), policy)
+        return Agent(about, partial(_function, made), policy, network=made)
     try:
         card = PolicyAbout.in_env(made.get_env())
     except (AttributeError, UnknownOption):  # it has no environment of this package any more
-        return Agent(about, partial(_model, made), policy)
-    return Agent(about, partial(_model, made, seen=seen_through(made.get_env())), policy, card)
+        return Agent(about, partial(_model, made), policy, network=made)
+    begin = partial(_model, made, seen=seen_through(made.get_env()))
+    return Agent(about, begin, policy, card, made)
+
+
+def _of_network(network: MlpPolicy, about: About, policy: object) -> Agent:
+    begin, remembers = partial(_network, network, about["name"]), network.n_remembered > 0
+    return Agent(about, begin, policy, network.made_for, network, remembers=remembers)
 
 
 def _description(policy: object) -> About:

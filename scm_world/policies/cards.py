@@ -24,6 +24,9 @@ from scm_world.world import Simulation
 KEY = "scm_world"
 """Metadata entry of a policy file that holds a ``PolicyAbout``."""
 
+HISTORY = "history"
+"""Part of an observation with its last pairs, shape (k, n), where it stands by itself."""
+
 FORM: Mapping[str, JsonValue] = {
     "action_mode": None,
     "delta_scale": 1.0,
@@ -36,6 +39,8 @@ FORM: Mapping[str, JsonValue] = {
     "keypoints": False,
     "pad": None,
     "normalize_observations": True,
+    "history": 0,
+    "stack_history": False,
     "goal_env": False,
 }
 """Options of an environment that define observations and actions, with the defaults of files."""

@@ -16,12 +16,13 @@ import weakref
 from collections.abc import Callable, Iterator
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
+from functools import lru_cache
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from multiprocessing.reduction import ForkingPickler
 from typing import Any, final
 
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 from scm_world.errors import EngineFailure, UnknownOption, in_one_line
 
@@ -114,8 +115,14 @@ def _set_variables() -> Iterator[None]:
         os.environ.update(before)
 
 
+@lru_cache(maxsize=1)
+def _libraries(modules: int) -> ThreadpoolController:
+    """Find the numerical libraries, which takes milliseconds; again when modules were imported."""
+    return ThreadpoolController()
+
+
 _VARIABLES = _Shared(_set_variables)
-_LIMITS = _Shared(lambda: threadpool_limits(limits=1))
+_LIMITS = _Shared(lambda: _libraries(len(sys.modules)).limit(limits=1))
 
 
 @contextmanager
