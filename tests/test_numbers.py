@@ -226,6 +226,7 @@ CASES: dict[str, Case] = {
             "goal_env": False,
             "max_episode_length": 7,
             "stack_images": False,
+            "stack_history": False,
         },
     ),
     "ScmWorldEnv.delta": (
@@ -332,7 +333,15 @@ CASES: dict[str, Case] = {
         lambda **k: str(
             evaluation.evaluate("still", "P5", env={"max_episode_length": 2}, backend="fake", **k)
         ),
-        {"n": 2, "workers": 1},
+        {"n": 2, "workers": 1, "steps": True},
+    ),
+    "inferred": (
+        lambda **k: str(
+            evaluation.inferred(
+                "still", "*.mass", env={"max_episode_length": 4}, backend="fake", **k
+            )
+        ),
+        {"n": 2, "seed": 1, "steps": [1], "at": 1, "after": 1, "workers": 1},
     ),
     "play": (
         lambda **k: evaluation.play(gymnasium.make(PUSHING, **SHORT), STILL, **k)[

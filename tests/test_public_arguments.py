@@ -284,6 +284,7 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
         "observation_mode": "structured", "observe": (), "include": (), "context": "none",
         "keypoints": False, "pad": None, "cameras": None, "image_size": None,
         "stack_images": False, "normalize_observations": True, "goal_env": False, "start": None,
+        "history": 1, "stack_history": False,
         "random_goal": None, "variables_space": None, "max_episode_length": 2,
         "max_episode_steps": None, "on_failure": "raise", "conventions": "scm_world",
         "render_mode": None, "render_camera": None, "render_size": None,
@@ -393,11 +394,21 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
     rest = {"backend": "fake", "env": {"max_episode_length": 1}, "out": None, "trusted": None}
     yield evaluation.evaluate, {
         "policy": "random", "protocols": ["P0"], "task": "pushing", "n": 1, "seeds": 0, **rest,
-        "workers": 1, "engine": None, "progress": None,
+        "workers": 1, "engine": None, "progress": None, "repeats": None, "steps": False,
+    }  # fmt: skip
+    yield evaluation.Adaptive, {
+        "policy": "random", "parameters": "mass", "measures": {"x": 0.1}, "after": 5,
+        "every": None, "iterations": 2, "last": None, "use": "mean",
     }  # fmt: skip
     yield evaluation.in_world, {"policy": "random", "world": world}
+    yield evaluation.inferred, {
+        "policy": "still", "variables": "tool_block.mass", "task": "pushing", "steps": [0],
+        "at": 0, "after": 0, "privileged": None, "n": 1, "seed": 0, **rest, "workers": 1,
+        "engine": None, "progress": None,
+    }  # fmt: skip
     yield evaluation.play, {
-        "env": env, "agent": agent, "plan": None, "hooks": (), "seed": 0, "episode": None
+        "env": env, "agent": agent, "plan": None, "hooks": (), "seed": 0, "episode": None,
+        "draws": None,
     }  # fmt: skip
     yield evaluation.protocols_of, {"task": "pushing", "backend": "fake"}
     yield evaluation.record, {
@@ -439,7 +450,7 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
     yield policies.WorldPolicy, {"policy": abs}
     yield policies.Agent, {"about": {"name": "a"}, "begin": abs, "policy": None, "card": None}
     yield policies.agent_from, {"about": agent.about, "trusted": ()}
-    yield policies.as_agent, {"policy": "random", "trusted": None}
+    yield policies.as_agent, {"policy": "random", "trusted": None, "env": None}
     network = policies.MlpPolicy((layer,))
     kept = policies.save_policy(folder / "policy.safetensors", network, about)
     yield policies.file_of, {"policy": kept}

@@ -86,8 +86,8 @@ HELP = {
     "executor": "Executor of independent episodes: serial, process or ray.",
     "workers": "How many run at the same time; 0 for as many as there are cores.",
     "address": "Address of a Ray cluster, or 'auto'; without it, Ray is started on this machine.",
-    "observations": "Observations of the policy: plain, or privileged: with every causal "
-    "parameter.",
+    "observations": "Observations of the policy: plain; privileged: with every causal parameter; "
+    "of PPO also critic: with them for the value alone.",
     "changes": "Any other field, such as worlds=16, network.hidden=[64,64], env.frame_skip=5, or "
     "trials.protocols=[] for no evaluations; the value is JSON or a word.",
     "quiet": "Print the result only.",
@@ -284,13 +284,13 @@ def tag(name: str) -> str:
     """Return the name of a system in titles and folders: of a file, its stem.
 
     Example:
-        >>> tag("pushing"), tag("models/cartpole.xml"), tag("my.worlds:cartpole")
+        >>> tag("pushing"), tag("C:/models/cartpole.xml"), tag("my.worlds:cartpole")
         ('pushing', 'cartpole', 'my.worlds-cartpole')
     """
+    if name.lower().endswith((".xml", ".mjcf", ".urdf")):
+        return Path(name).stem
     home, colon, function = name.rpartition(":")
-    if colon:
-        return f"{Path(home).stem if home.endswith('.py') else home}-{function}"
-    return Path(name).stem if name.lower().endswith((".xml", ".mjcf", ".urdf")) else name
+    return f"{Path(home).stem if home.endswith('.py') else home}-{function}" if colon else name
 
 
 # --- groups ---------------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,11 +15,15 @@ import typer
 
 from scm_world._arguments import one_of
 from scm_world.cli import console, options
-from scm_world.cli.options import load_system, parse_assignments, split, tag
+from scm_world.cli.options import load_system, parse_assignments, parse_value, split, tag
 from scm_world.errors import ConflictingTargets, UnknownOption
 
 if TYPE_CHECKING:
     from scm_world.training.loop import Trained
+
+
+SHOWN = 10
+"""Rows about the control steps of an episode, about."""
 
 
 @dataclass
@@ -77,6 +82,9 @@ def train(
     threads: int | None = None,
     start: Path | None = None,
     device: str = "auto",
+    log: options.Text = None,
+    sweep: options.Pairs = None,
+    trials: Annotated[int, typer.Option(min=1)] = 20,
     onnx: bool = False,
     show_recipe: bool = False,
     common: Training,
@@ -87,8 +95,8 @@ def train(
     Example: scm-world train reaching --set n_steps=128 --out my-reacher
 
     Args:
-        algo: ppo, sac or td3 of Stable-Baselines3, or rsl_ppo of rsl-rl; by default ppo, on an
-            engine that steps thousands of worlds together rsl_ppo.
+        algo: ppo, sac or td3 of Stable-Baselines3, recurrent_ppo of sb3-contrib, or rsl_ppo of
+            rsl-rl; by default ppo, on an engine that steps thousands of worlds together rsl_ppo.
         curriculum: Variation: 0 for none, 1 for goals, 2 for everything (gravity and gains, too),
             a protocol such as P10, or the JSON file of a curriculum; by default the tuned one.
         recipe: JSON file of a recipe; by default the one tuned for the task.
@@ -97,6 +105,11 @@ def train(
             backend, and one for torch.
         start: Policy to start from.
         device: auto, cpu or cuda.
+        log: Where the numbers of each round go besides progress.csv: tensorboard, wandb or trackio,
+            several with commas; by default tensorboard, if the library has it.
+        sweep: Search for a value of the recipe: NAME=LOW:HIGH, NAME=LOW:HIGH:log, or NAME=[A,B] for
+            one of a list. Each trial is a training; the best recipe is in best.json.
+        trials: Trainings of a search.
         onnx: Write the policy as ONNX, too.
         show_recipe: Print the recipe as JSON, and do nothing.
     """
@@ -122,13 +135,33 @@ def train(
     from scm_world.training import loop
 
     words = "train", tag(made.task), made.algo, made.name
+    if sweep:
+        from scm_world.training.sweep import sweep as search
+
+        space = parse_assignments(sweep, "'--sweep'", _range)
+        how: dict[str, Any] = {"start": start, "device": device, "threads": threads, "log": log}
+        with common.job(task, "sweep", *words, files="results/*.json", what="trials") as job:
+            tried = search(made, space, trials=trials, **how, **job)
+        console.frame(
+            [{"trial": r["number"], "score": r["score"], **r["values"]} for r in tried.rows]
+        )
+        console.written(tried.folder / "sweep.json", tried.folder / "sweep.csv")
+        if tried.best is not None:
+            console.say(f"train:    scm-world train {task} --recipe {tried.folder / 'best.json'}")
+        return
     with common.job(task, *words, files="checkpoints/*.zip", what="steps") as job:
-        found = loop.train(made, start=start, device=device, threads=threads, **job)
+        found = loop.train(made, start=start, device=device, threads=threads, log=log, **job)
     common.tell(found, made.task)
     if onnx:
         from scm_world.training.export import to_onnx
 
         console.say(f"ONNX:     {to_onnx(found.best, found.best.with_suffix('.onnx'))}")
+
+
+def _range(text: str, hint: str) -> object:
+    """Read ``LOW:HIGH`` and ``LOW:HIGH:log``; any other value as it is."""
+    ends = [parse_value(one, hint) for one in text.split(":")]
+    return tuple(ends) if len(ends) > 1 else ends[0]
 
 
 def clone(
@@ -142,7 +175,7 @@ def clone(
     workers: options.ManyWorkers = 0,
     common: Training,
 ) -> None:
-    """Train a network by imitation of a scripted policy, or of recordings.
+    """Train a network by imitation of a scripted or trained policy, or of recordings.
 
     Episodes that end well are learned from. After an interruption the same command resumes.
     'scm-world evaluate' takes the policy. 'scm-world train --start' starts from it where the recipe
@@ -151,7 +184,8 @@ def clone(
     Example: scm-world clone picking --episodes 200 --out my-picker
 
     Args:
-        from_: A policy that sees the whole world, such as feedback; a recording (.parquet), or a
+        from_: A policy that sees the whole world, such as feedback; a trained one, in its own
+            observations: the folder of its run, its file or zoo:NAME; a recording (.parquet), or a
             folder of recordings.
         episodes: Demonstrations of the teacher.
         protocols: Protocols of these demonstrations: names with commas.
@@ -166,18 +200,21 @@ def clone(
     from scm_world.runs.processes import cores
     from scm_world.training import imitation
 
+    is_policy = from_ is not None and (from_ in NAMED or imitation.is_policy(from_))
     fields = common.fields(
-        teacher=from_ if from_ in NAMED else None,
+        teacher=from_ if is_policy else None,
         episodes=episodes,
         protocols=None if protocols is None else split(protocols),
         noise=noise,
         rounds=rounds,
     )
     made = imitation.lesson(task, **fields)
-    path = None if from_ is None or from_ in NAMED else Path(from_)
+    path = None if from_ is None or is_policy else Path(from_)
     if path is not None and not path.exists():
-        raise UnknownOption("--from", from_, (*NAMED, "a recording or a folder of some"))
-    words = "clone", tag(made.task), made.teacher if path is None else path.stem
+        allowed = "a trained policy or the folder of its run", "a recording or a folder of some"
+        raise UnknownOption("--from", from_, (*NAMED, *allowed))
+    who = made.teacher.replace(":", "-") if path is None else str(path)
+    words = "clone", tag(made.task), Path(who).stem
     with common.job(task, *words, files="demonstrations/*.npz", what="episodes") as job:
         found = imitation.clone(path, made, workers=workers or cores(), **job)
     common.tell(found, task)
@@ -194,6 +231,9 @@ def evaluate(
     env: options.Pairs = None,
     option: options.Pairs = None,
     metric: options.Text = None,
+    repeats: Annotated[int | None, typer.Option(min=1)] = None,
+    steps: bool = False,
+    reference: options.Text = None,
     trust: options.Words = None,
     out: options.Out = None,
     jobs: options.ManyJobs,
@@ -220,6 +260,10 @@ def evaluate(
         env: Option of the environment, such as frame_skip=3.
         metric: Score that is shown and drawn; all are written. By default
             last_fractional_success, or return where a task has none.
+        repeats: For how many episodes in a row each draw holds, for agents that remember.
+        steps: Keep the reward of each control step, and show it since an intervention within
+            episodes.
+        reference: Name of the policy with which the others are compared.
     """
     from scm_world import evaluation
     from scm_world.evaluation import METRICS
@@ -229,6 +273,7 @@ def evaluate(
     sys.path.insert(0, str(Path.cwd()))  # for modules of the working directory
     one_of("metric", metric, (None, *METRICS))
     agents = policies_of(policy)
+    one_of("--reference", reference, (None, *agents))
     task = task or task_of(agents)
     made = load_system(task, option).task()
     settings = parse_assignments(env, "'--env'")
@@ -238,6 +283,7 @@ def evaluate(
     folder = console.results_folder(out, "evaluate", *words)
     named = (text.partition(":")[0] for runs in agents.values() for text in runs if ":" in text)
     how: dict[str, Any] = {"task": task, "n": n, "seeds": seeds, "env": settings}
+    how |= {"repeats": repeats, "steps": steps}
     if trust:
         how["trusted"] = (*trust, *(name.partition(".")[0] for name in named))
     with jobs.open("episodes", folder, "parts/*.json", "files") as job:
@@ -248,7 +294,7 @@ def evaluate(
     files = *found.save(folder), *write_figures(found, folder, metric)
     docs = {one["name"]: one.get("doc", "") for one in found.about["protocols"]}
     engines = found.engines
-    rows, gaps = [], []
+    rows, gaps, regrets, learned, curves = [], [], [], [], []
     for name in found.protocols:
         scores = {
             agent if len(engines) == 1 else f"{agent}, {engine}": found.score(
@@ -261,7 +307,31 @@ def evaluate(
         if len(engines) == 2:
             apart = {a: found.difference(*engines, name, metric, agent=a) for a in found.agents}
             gaps.append({"protocol": name, **apart})
+        for engine, agent in product(engines, found.agents):
+            who = {"protocol": name, "policy": agent} | (
+                {"backend": engine} if len(engines) > 1 else {}
+            )
+            if reference not in (None, agent):
+                pair = {"regret": found.regret(agent, str(reference), name, metric, engine=engine)}
+                wins = found.probability_of_improvement
+                pair["better"] = wins(agent, str(reference), name, metric, engine=engine)
+                regrets.append({**who, **pair})
+            if repeats and repeats > 1:
+                *each, last = found.attempts(name, metric, agent=agent, engine=engine)
+                numbered = {f"episode {k}": score for k, score in enumerate(each, 1)}
+                learned.append({**who, **numbered, "last - first": last})
+            if steps and "@" in name:
+                size = -(-(found.rewards.shape[1]) // SHOWN)  # type: ignore[union-attr] # asked for
+                shown = found.since(name, agent=agent, engine=engine, every=size)
+                curves += [{**who, **row} for row in shown.to_dict("records")]
     console.frame(rows, title=f"{metric.replace('_', ' ')} in {found.task}, with 95 % intervals")
+    if regrets:
+        said = f"regret to {reference}, and probability to score higher than it, by draw"
+        console.frame(regrets, title=said)
+    if learned:
+        console.frame(learned, title=f"{repeats} episodes of each draw, one after another")
+    if curves:
+        console.frame(curves, title="mean reward by control step since the intervention")
     if gaps:
         console.frame(gaps, title=f"{' minus '.join(engines)}, the same draws on both")
     console.written(*files)
@@ -298,6 +368,7 @@ def explain(
     backend: options.Text = None,
     metric: options.Text = None,
     versus: options.Text = None,
+    inferred: Annotated[str | None, typer.Option(metavar="FILE")] = None,
     trust: options.Words = None,
 ) -> None:
     """Print which variables decided the scores, or the counterfactuals of one episode.
@@ -313,8 +384,11 @@ def explain(
         metric: Score that is explained. By default last_fractional_success, or success or return
             where a task has none.
         versus: Value of the variable instead: A (from the training support) or default.
+        inferred: An inferred.json of 'scm-world infer' for this agent: variables that matter and
+            that it does not infer are marked.
     """
-    from scm_world.evaluation import Evaluation, why
+    from scm_world.evaluation import Evaluation, Inferred, why
+    from scm_world.evaluation.statistics.causes import missing
 
     if trust:
         sys.path.insert(0, str(Path.cwd()))  # for modules of the working directory
@@ -326,9 +400,10 @@ def explain(
         one_of(name, given, (*known, None) if len(known) == 1 else known)
     metric = found.metric(metric)
     chosen = {"agent": agent or found.agents[0], "engine": backend or found.engines[0]}
+    judged = None if inferred is None else Inferred.load(inferred)
     if episode is None:
         for name in found.protocols if protocol is None else (protocol,):
-            causes = found.causes(name, metric, **chosen)
+            causes = found.causes(name, metric, **chosen, inferred=judged)
             score = found.score(name, metric, **chosen)
             about = f"{chosen['agent']} on {chosen['engine']}, {metric.replace('_', ' ')} {score}"
             console.say(f"{name}: {about}", str(causes) or "nothing is varied in it", "")
@@ -339,4 +414,70 @@ def explain(
     with console.progress("counterfactuals") as tell:
         reasons = why(found.only(**chosen), protocol, episode, **how, progress=tell)
     title = f"{protocol}, episode {episode}: {metric.replace('_', ' ')} {reasons.score:.3g}"
-    console.say(title, reasons)
+    matter = [one.variable for one in reasons.others if one.gain]
+    console.say(title, reasons, *missing({} if judged is None else judged.verdicts(), matter))
+
+
+def infer(
+    policy: Annotated[str, typer.Argument(metavar="POLICY")],
+    task: Annotated[str | None, typer.Argument(metavar="SYSTEM")] = None,
+    *,
+    variables: Annotated[str, typer.Option()],
+    space: str = "A",
+    steps: options.Text = None,
+    at: Annotated[int | None, typer.Option(min=0)] = None,
+    after: Annotated[int | None, typer.Option(min=0)] = None,
+    privileged: options.Text = None,
+    n: options.N = 200,
+    seed: options.NotNegative = 0,
+    backend: options.Text = None,
+    env: options.Pairs = None,
+    option: options.Pairs = None,
+    trust: options.Words = None,
+    out: options.Out = None,
+    jobs: options.ManyJobs,
+) -> None:
+    """Find out which hidden causes a policy infers, and how its actions follow them.
+
+    Probes of its hidden state, with controls, and twin episodes in which a cause is set. Writes
+    inferred.json. After Ctrl-C (exit code 130) the same command resumes.
+    Example: scm-world infer zoo:pushing --variables tool_block.mass -n 100
+
+    Args:
+        policy: As for 'scm-world evaluate', one.
+        task: As for 'scm-world evaluate'.
+        variables: Names or patterns of the causes, with commas.
+        space: Where they are drawn from: A, B or A|B.
+        steps: Control steps that are probed, with commas, in addition to the last one; by default
+            5,25,100.
+        at: Control step at which twin episodes set a cause, 0 for none; by default 25, or a quarter
+            of a shorter episode.
+        after: Control steps until actions are compared; likewise.
+        privileged: A policy that sees the causes, to compare the direction of changes.
+        n: Episodes.
+        seed: Seed of the noise.
+        backend: Physics backend; that of the task by default.
+        env: Option of the environment, such as history=8.
+    """
+    from scm_world import evaluation
+    from scm_world.evaluation.preparation import task_of
+
+    sys.path.insert(0, str(Path.cwd()))  # for modules of the working directory
+    task = task or task_of(policy)
+    made = load_system(task, option).task()
+    settings = parse_assignments(env, "'--env'")
+    if option:
+        settings["task_options"] = dict(made.given)
+    folder = console.results_folder(out, "infer", tag(policy), tag(task), variables, str(seed))
+    how: dict[str, Any] = {"task": task, "n": n, "seed": seed, "env": settings}
+    how |= {"at": at, "after": after, "privileged": privileged}
+    named = (text.partition(":")[0] for text in (policy, privileged or "") if ":" in text)
+    if trust:
+        how["trusted"] = (*trust, *(name.partition(".")[0] for name in named))
+    if steps is not None:
+        how["steps"] = [int(word) for word in split(steps)]
+    drawn = evaluation.Protocol("drawn", split(variables), space)
+    with jobs.open("episodes", folder, "parts/*.npz", "files") as job:
+        found = evaluation.inferred(policy, drawn, backend=backend or made.backend, **how, **job)
+    console.say(found)
+    console.written(found.save(folder / "inferred.json"))

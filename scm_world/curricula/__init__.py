@@ -26,7 +26,7 @@ from scm_world.curricula.parts import (
     timed,
     together,
 )
-from scm_world.curricula.wrapper import CurriculumEnv, CurriculumState, make_vec
+from scm_world.curricula.wrapper import CurriculumEnv, CurriculumState, LevelsEnv, make_vec
 from scm_world.variables import AB, A, B, Subset
 
 __all__ = [
@@ -36,6 +36,7 @@ __all__ = [
     "Curriculum",
     "CurriculumEnv",
     "CurriculumState",
+    "LevelsEnv",
     "Progress",
     "Situation",
     "Subset",

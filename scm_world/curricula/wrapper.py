@@ -9,6 +9,7 @@ from functools import partial
 from typing import Any, final
 
 import gymnasium
+import numpy as np
 from gymnasium.envs.registration import VectorizeMode
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
@@ -120,7 +121,8 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         Args:
             seed: Seed of the noise.
             options: As without this wrapper. ``"do"`` lies above the curriculum: a shift acts on
-                what that makes of a variable. ``"episode"`` is its number for the curriculum, too.
+                what that makes of a variable. ``"draws"``, or else ``"episode"``, is its number for
+                the curriculum, too.
 
         Raises:
             InterventionError: An intervention was refused.
@@ -143,7 +145,9 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             seed = place[0]
             given |= {"episode": place[1]} if place[1] else {}
         compiled, seeded = world.structures.natural(None), Noise(place[0])
-        situation = Situation(found.episode, found.stages, compiled, seeded, place[1])
+        drawn = given.get("draws")
+        numbers = (found.episode, place[1]) if drawn is None else (drawn, drawn)
+        situation = Situation(numbers[0], found.stages, compiled, seeded, numbers[1])
         given["do"] = self._plan(situation, Plan(given.get("do")))
         shown = self.env.reset(seed=seed, options=given)
         self._state, self._staged = found.model_copy(update={"noise": place}), situation.staged
@@ -192,8 +196,50 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         self._state, self._staged = now.model_copy(update=then), None
 
 
-def _member(curriculum: Part, **options: Any) -> CurriculumEnv:
-    return CurriculumEnv(ScmWorldEnv(**options), curriculum)
+@final
+class LevelsEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+    """Plays episodes of a fixed set: level i is episode i of the noise of a seed.
+
+    A reset draws a level uniformly, unless ``options["episode"]`` names one; its ``seed`` is that
+    of these draws. So ``reset(seed=level_seed, options={"episode": i})`` of the environment inside
+    is level i.
+
+    Args:
+        env: A ``CurriculumEnv``, or an environment of this package in other wrappers.
+        levels: How many there are.
+        level_seed: Seed of their noise.
+
+    Source:
+        Cobbe et al., *Leveraging Procedural Generation to Benchmark Reinforcement Learning*, ICML
+        2020.
+    """
+
+    @typed
+    def __init__(self, env: gymnasium.Env[Any, Any], levels: int, level_seed: int = 0) -> None:
+        RecordConstructorArgs.__init__(self, levels=levels, level_seed=level_seed)
+        super().__init__(env)
+        unwrapped_env(env, "LevelsEnv")
+        self.levels = whole_number("levels", levels, least=1)
+        self.level_seed = whole_number("level_seed", level_seed, least=0)
+        self._draws = np.random.default_rng()
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode of a level; errors are those of the environment inside."""
+        if seed is not None:
+            self._draws = np.random.default_rng(whole_number("seed", seed, least=0))
+        given = {"episode": None, **reset_options(options, RESETS)}
+        if given["episode"] is None:
+            given["episode"] = int(self._draws.integers(self.levels))
+        return self.env.reset(seed=self.level_seed, options=given)
+
+
+def _member(
+    curriculum: Part, levels: int | None, level_seed: int, **options: Any
+) -> CurriculumEnv | LevelsEnv:
+    found = CurriculumEnv(ScmWorldEnv(**options), curriculum)
+    return found if levels is None else LevelsEnv(found, levels, level_seed)
 
 
 @typed
@@ -203,6 +249,8 @@ def make_vec(
     curriculum: Part,
     *,
     autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
+    levels: int | None = None,
+    level_seed: int = 0,
     **options: object,
 ) -> ScmWorldVectorEnv | AsyncVectorEnv:
     """Make several environments that each play a part of the episodes of a curriculum.
@@ -217,6 +265,9 @@ def make_vec(
         num_envs: Number of environments.
         curriculum: The curriculum of all of them; see ``CurriculumEnv``.
         autoreset_mode: When a member that is done is reset, as in Gymnasium.
+        levels: Number of levels, which all environments play, each drawn uniformly; None for new
+            draws in every episode. See ``LevelsEnv``.
+        level_seed: Seed of the noise of the levels.
         options: Options of the environments; ``threads`` and ``workers``, see ``vector_env``.
 
     Returns:
@@ -235,7 +286,7 @@ def make_vec(
     except gymnasium.error.Error as error:
         allowed = (*IDS.values(), in_one_line(error))
         raise UnknownOption("env_id", env_id, allowed) from None
-    given: dict[str, Any] = {**options, "member": partial(_member, curriculum)}
+    given: dict[str, Any] = {**options, "member": partial(_member, curriculum, levels, level_seed)}
     mode = VectorizeMode.VECTOR_ENTRY_POINT
     envs: ScmWorldVectorEnv | AsyncVectorEnv = gymnasium.make_vec(  # type: ignore[assignment] # ours
         env_id, count, vectorization_mode=mode, autoreset_mode=autoreset_mode, **given

@@ -45,6 +45,7 @@ class Actions:
         converts: Whether ``absolute`` is more than the action itself.
         scale: What a world needs to know of them; see ``CompiledTask.clipped``.
         reads: The variable that actions are relative to; None if that is the last command.
+        bounds: The least and the greatest number of each part of an action, shape (n,).
         space: Space of the actions; relative ones reach half of the range to either side. Where
             all are whole numbers it is ``Discrete`` or ``MultiDiscrete``, counted from 0.
     """
@@ -71,6 +72,8 @@ class Actions:
             counts = (self._high + 1.0).astype(np.int64)
             several = gymnasium.spaces.MultiDiscrete(counts)
             self.space = gymnasium.spaces.Discrete(int(counts[0])) if low.size == 1 else several
+        low, high = self.ends
+        self.bounds = np.ravel(low).astype(float), np.ravel(high).astype(float)
         self.reads: str | None = None
         self._gain, self._reach = 1.0, (self._high - self._low) / 2.0
         mode = world.options.action_mode
@@ -93,6 +96,7 @@ class Actions:
         else:
             self._reach = scale * self._reach
         self.space = box(-self._reach, self._reach)
+        self.bounds = -self._reach, self._reach
         self.reads = TIPS if mode == TIPS else None if origin == COMMAND else mode
         if self.reads not in (None, TIPS, JOINTS):
             allowed = (f"{COMMAND!r}, or action_mode={PREFIX + JOINTS!r}",)
@@ -105,6 +109,10 @@ class Actions:
         if self._is_choice:
             return self._low.reshape(space.shape), self._high.reshape(space.shape)
         return space.low, space.high
+
+    def in_space(self, actions: Any) -> Any:
+        """Clip actions to the space, as they are executed, shape (..., n)."""
+        return actions.clip(*self.bounds)
 
     def read(self, action: ArrayLike) -> Floats:
         """Return an action or a command as it is, checked, shape (n,)."""
@@ -161,7 +169,7 @@ class Actions:
     def with_arrays(self, made: Callable[[Floats], Any]) -> Any:
         """Return the same with arrays of another library, for ``moved`` and ``scale``."""
         other = copy.copy(self)
-        for name in ("_middle", "_half", "_low", "_high", "_reach", "scale"):
+        for name in ("_middle", "_half", "_low", "_high", "_reach", "scale", "bounds"):
             setattr(other, name, made(getattr(self, name)))
         return other
 

@@ -118,6 +118,11 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         worlds: list[Any] = [inner.world for inner in self._inner]
         self._batch = worlds[0].batched(worlds, threads=threads, names=self._names)
         self._counting = hasattr(first, "over")
+        self._history = None
+        if lead.history is not None:  # one for all of them, of which each has its row
+            self._history = lead.history.on(lead.history.rows.repeat(count, axis=0))
+            for row, inner in enumerate(self._inner):
+                inner.history = self._history.on(self._history.rows[row : row + 1])
 
     # --- episodes ---------------------------------------------------------------------------------
 
@@ -218,6 +223,9 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         if not len(rows):
             return
         commands = self._commanded(rows, actions)
+        for row in rows.tolist() if self._history is not None else ():
+            self._inner[row].update_history()
+        indices = self._indices(rows)
         before = self._batch.by_structure(rows) if self._inner[0].truncates_failures else []
         kept = [table.numbers[members] for table, members in before]
         moved = rows
@@ -225,6 +233,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
             self._batch.advance(commands, which)
         except (FunctionFailure, EngineFailure) as error:
             if not (kept and isinstance(error, EngineFailure) and error.diverged):
+                self._remember(rows, indices, actions)
                 self._read_alone(rows.tolist())
                 raise located(error, error.row or 0, "environment") from error.__cause__
             failed = np.union1d(error.lost, error.unmoved).astype(int)
@@ -236,6 +245,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
             self._rewards[failed] = 0.0
             self._terminations[failed], self._truncations[failed] = False, True
             moved = np.setdiff1d(rows, failed)
+        self._remember(rows, indices, actions)
         for table, members in self._batch.by_structure(moved):
             if moved is not rows:
                 table.evaluate(self._names, members)
@@ -248,6 +258,19 @@ class ScmWorldVectorEnv(SyncVectorEnv):
             success = self._known.get("is_success", np.zeros(self.num_envs, bool))
             for row in rows[ended[rows]].tolist():
                 self.envs[row].get_wrapper_attr("over")(success=bool(success[row]))
+
+    def _indices(self, rows: Integers) -> Integers:
+        """Return the control steps of some environments with a history."""
+        found = np.zeros(self.num_envs, int)
+        for table, members in self._batch.by_structure(rows) if self._history is not None else ():
+            found[members] = table.numbers[members, table.compiled.clock]
+        return found[rows]
+
+    def _remember(self, rows: Integers, indices: Integers, actions: Floats) -> None:
+        """Add a pair to the histories of those environments that have taken a step since."""
+        if self._history is not None:
+            which = rows[self._indices(rows) > indices]
+            self._history.push(which, self._inner[0].actions.in_space(actions[which]))
 
     def _take(self, table: Rows, rows: Integers) -> None:
         """Write what a step led to in environments of one structure."""
@@ -267,6 +290,10 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         self._terminations[place] = ended
         self._truncations[place] = now.numbers[:, now.compiled.clock] >= lead.limit
         observation = lead.observer.observe(now) if lead.observer.together else None
+        if self._history is not None and observation is not None:
+            observation = self._history.observe(observation, rows)
+            for row in rows.tolist():
+                self._inner[row].note_observed()
         self._write(place, observation, info)
         alone = rows if observation is None else rows[:0]
         if SENSOR_NOISE in now and observation is not None:

@@ -6,8 +6,8 @@ import inspect
 import math
 import reprlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, final
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, cast, final
 from weakref import WeakKeyDictionary
 
 import gymnasium
@@ -30,12 +30,14 @@ from scm_world.env.arguments import (
     ranges,
     reset_options,
 )
+from scm_world.env.history import History
 from scm_world.env.observer import FAILED, Observer, check_options
 from scm_world.env.pictures import Cameras, has_screen, height_and_width, read_camera
 from scm_world.env.vector import Vector
 from scm_world.errors import (
     EngineError,
     EngineFailure,
+    InterventionError,
     ModelError,
     NotReset,
     SnapshotMismatch,
@@ -62,6 +64,8 @@ if TYPE_CHECKING:
 
 RENDER_MODES = ("rgb_array", "human")
 ON_FAILURE = ("raise", "truncate")
+FIRST = np.zeros(1, int)
+"""The row of one environment."""
 
 
 @final
@@ -74,12 +78,14 @@ class EnvSnapshot:
         interventions: The interventions so far.
         ended: Whether the episode is over and the next one begins with the next step of a batch.
         memory: The state of a curriculum around it.
+        history: The last observations and actions, with the option ``history``.
     """
 
     world: Snapshot
     interventions: tuple[tuple[int, dict[str, Any]], ...]
     ended: bool = False
     memory: tuple[Any, ...] | None = None
+    history: NDArray[np.float32] | None = field(default=None, compare=False)
 
 
 class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
@@ -117,7 +123,9 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         include: Likewise, to append to the vector.
         context: Where the parameters that can be intervened on are: ``"none"``,
             ``"observation"``: appended to the vector; ``"privileged"``: in a dictionary beside
-            it. The noise of the sensors does not reach them.
+            it. Names or patterns append these only, like ``{"observation": names}``;
+            ``{"privileged": ["*.mass"]}`` has them beside it. The noise of the sensors does not
+            reach them.
         keypoints: ``"view"``: append the view of a hand of every block that has a goal, see
             ``scm_world.tasks.trifinger.views``.
         pad: Values of variables that decide which bodies exist: ``{"number_of_obstacles": 3}``. The
@@ -128,6 +136,12 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         stack_images: Whether all pictures are the channels of one, as convolutional networks (the
             ``CnnPolicy`` of Stable-Baselines3) take them.
         normalize_observations: Give numbers in [-1, 1] instead of SI units.
+        history: How many last pairs of observation and action, at most 1,000, follow the present
+            observation, the newest first: n + history * (n + n_actions) numbers, zeros where there
+            was no step. The observation of a pair is that of the instant in which the action was
+            taken, and the action is the agent's, clipped to ``action_space``.
+        stack_history: Give a dictionary with ``observation`` and ``history``, shape (history, n +
+            n_actions), instead.
         goal_env: Give a dictionary with ``observation``, ``achieved_goal``, ``desired_goal``, as
             ``compute_reward`` takes them.
         start: An intervention at every reset; a value may be a space or distribution to draw from,
@@ -153,10 +167,13 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
     Attributes:
         world: Its ``World``, which can be asked; questions leave the environment as it is.
         observer: The observation of the present structure; so are the next three.
-        layout: Where each variable stands in the vector that is observed; empty for pictures.
+        layout: Where each variable stands in the vector that is observed; empty for pictures. Of
+            ``history``: ``"joint_positions@-1"``, and ``"agent.action@-1"``, the last action.
         observed: The variables that the observation is made of; None of pictures, which show many.
         info_shapes: The shape of each entry of ``info``, without the dictionary ``reward_terms``.
+        appended: The parameters that ``context`` adds to the vector.
         actions: What actions mean.
+        history: The last observations and actions; None without the option.
 
     Raises:
         UnknownOption: An option does not exist, or does not go with the others.
@@ -193,13 +210,15 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         observation_mode: str = "structured",
         observe: Iterable[str] = (),
         include: Iterable[str] = (),
-        context: str = "none",
+        context: str | Iterable[str] | Mapping[str, str | Iterable[str]] = "none",
         keypoints: str | bool = False,
         pad: Mapping[str, Any] | None = None,
         cameras: Sequence[str | Camera] | None = None,
         image_size: int | tuple[int, int] | None = None,
         stack_images: bool = False,
         normalize_observations: bool = True,
+        history: int = 0,
+        stack_history: bool = False,
         goal_env: bool = False,
         start: Mapping[str, Any] | None = None,
         random_goal: SpaceName | None = None,
@@ -290,7 +309,8 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         self._version = -1
         self._done: list[tuple[int, dict[str, Any]]] = []
         self._known: WeakKeyDictionary[CompiledTask, Observer] = WeakKeyDictionary()
-        self._largest = None
+        self._largest, self.history = None, cast("History | None", None)
+        self._seen_at = (-1, -1)  # version and control step of the observation in the history
         if pad is not None:
             for name in asked(pad):
                 if name not in self.world.structures.head:
@@ -333,19 +353,29 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
     def _arrange(self, declaration: CompiledTask) -> None:
         if declaration not in self._known:
             largest = self._largest or declaration
-            self._known[declaration] = Observer(self.world, declaration, self._how, largest)
-        self._declaration = declaration
-        self.observer = observer = self._known[declaration]
+            ends = self.actions.bounds
+            self._known[declaration] = Observer(self.world, declaration, self._how, largest, ends)
+        observer = self._known[declaration]
+        if self.history is not None and observer.layout != self.history.layout:
+            raise InterventionError(
+                "an intervention changes which bodies exist, and with them what is observed, while "
+                f"a history has observations of one kind: beside history={self._how['history']}, "
+                "give pad={…}, the most bodies that there can be",
+                variable=next(iter(self.world.structures.head)),
+            )
+        if self._how["history"] and self.history is None:
+            self.history = observer.history
+        self._declaration, self.observer = declaration, observer
         self.observation_space, self.info_shapes = observer.space, observer.info_shapes
-        self.layout = observer.parts["observation"].layout
+        self.layout, self.appended = observer.layout, observer.appended
         self.observed = None if self._how["observation_mode"] == "pixel" else observer.names
 
     def follow(self) -> None:
         """Observe the structure that there is, if it has changed."""
         if self._version != self.world.version:
-            self._version = self.world.version
             if self.world.compiled is not self._declaration:
                 self._arrange(self.world.compiled)
+            self._version = self.world.version
 
     def _look(self) -> Rows:
         """Compute the present values that are needed."""
@@ -355,6 +385,23 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         now = self.world.row
         now.evaluate(self.observer.needed)
         return now
+
+    def _observed(self, now: Rows) -> Observation:
+        """Return the observation of the present values."""
+        found = self.observer.observe(now)
+        if self.history is None:
+            return found
+        self.note_observed()
+        return self.history.observe(found, 0)
+
+    def note_observed(self) -> None:
+        """Note that the history has the present observation."""
+        self._seen_at = self.world.version, self.world.index
+
+    def update_history(self) -> None:
+        """Observe again what a pair of the history needs, if the world has changed since."""
+        if self.history is not None and self._seen_at != (self.world.version, self.world.index):
+            self.observe()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -367,7 +414,8 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
                 whose times lie within it. Where it
                 sets what ``start`` or a random goal sets too, it counts. ``{"episode": n}``: the
                 number of the episode within the noise; the next one if not given, 0 with a seed.
-                ``{"space": …}``: the space in which every target must lie.
+                ``{"space": …}``: the space in which every target must lie. ``{"draws": n}``: the
+                number of the episode whose draws hold, see ``World.reset``.
 
         Raises:
             UnknownOption: Another key.
@@ -381,16 +429,17 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         if number is not None and seed is None:
             seed = self.world.noise.seed
         self._done = []
-        self.world.reset(
-            seed=seed, episode=0 if number is None else number, do=request, space=space
-        )
+        if self.history is not None:
+            self.history.rows[:] = 0.0
+        drawn: Any = {"space": space, "draws": asked_for.get("draws")}
+        self.world.reset(seed=seed, episode=0 if number is None else number, do=request, **drawn)
         if request:
             self._note()
         now = self._look()
         for name in self._terms:
             one_number(now, name, (name,))
         self._show()
-        return self.observer.observe(now), self.observer.outcome(now)[2]
+        return self._observed(now), self.observer.outcome(now)[2]
 
     def beginning(self, do: Mapping[str, Any] | None) -> Mapping[str, Any]:
         """Return the interventions of a reset: those of the caller, over goal and ``start``."""
@@ -424,7 +473,10 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
             EngineFailure: The engine cannot take the step; see ``on_failure``.
         """
         world = self.world
-        actions = self.actions
+        actions, history, index = self.actions, self.history, 0
+        if history is not None:
+            self.update_history()
+            index = world.index
         try:
             world.advance(actions.absolute(action) if actions.converts else action, actions.scale)
         except EngineFailure as error:
@@ -432,6 +484,9 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
                 raise
             observation, info = self.present_of_failure()
             return observation, 0.0, False, True, info
+        finally:
+            if history is not None and world.has_begun and world.index > index:
+                history.push(FIRST, actions.in_space(np.ravel(action)))
         if self._version != world.version:
             self.follow()
         now = world.row
@@ -446,7 +501,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         if self.render_mode == "human":
             self._show()
         scaled = self.reward_scale * reward
-        return self.observer.observe(now), scaled, terminated, truncated, info
+        return self._observed(now), scaled, terminated, truncated, info
 
     def act(self) -> bool:
         """Apply the interventions that the plan has for this instant; return whether it has any.
@@ -490,11 +545,13 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         """Return the observation of other values of the ``observed`` variables, without noise.
 
         Raises:
-            UnknownOption: The observation is not a vector, or a value is missing.
+            UnknownOption: The observation is not a vector, or has a history, or a value is missing.
         """
         vector, names = self.observer.parts["observation"], self.observer.names
         if not isinstance(vector, Vector) or isinstance(self.observation_space, spaces.Dict):
             raise UnknownOption("observation of values", self.observation_space, ("a vector",))
+        if self.history is not None:  # values of an instant have no past
+            raise UnknownOption("history for observe_values", self._how["history"], ("0",))
         if not isinstance(values, Mapping) or not values.keys() >= {*names}:
             raise UnknownOption("values of an observation", values, names)
         return vector.observe_values(values)
@@ -502,7 +559,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
     def present(self) -> tuple[Observation, dict[str, Any]]:
         """Return the present observation and info, as after an intervention."""
         now = self._look()
-        return self.observer.observe(now), self.observer.outcome(now)[2]
+        return self._observed(now), self.observer.outcome(now)[2]
 
     def present_of_failure(self) -> tuple[Observation, dict[str, Any]]:
         """Return the last observation and info of an episode that ends since its world failed."""
@@ -582,7 +639,8 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         Raises:
             NotReset: No episode has begun.
         """
-        return EnvSnapshot(self.world.snapshot(), tuple(self._done))
+        past = None if self.history is None else self.history.rows.copy()
+        return EnvSnapshot(self.world.snapshot(), tuple(self._done), history=past)
 
     def restore(self, snapshot: EnvSnapshot) -> None:
         """Restore a snapshot, bit for bit.
@@ -593,7 +651,12 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         if not isinstance(snapshot, EnvSnapshot):
             found = reprlib.repr(snapshot)
             raise SnapshotMismatch(f"{found} is not a snapshot; give the result of snapshot()")
+        past = None if self.history is None else self.history.rows
+        if getattr(past, "shape", None) != getattr(snapshot.history, "shape", None):
+            raise SnapshotMismatch("it is one of an environment with another history=…")
         self.world.restore(snapshot.world)
+        if past is not None:
+            past[...] = snapshot.history
         self._done = list(snapshot.interventions)
 
     def __getstate__(self) -> dict[str, Any]:

@@ -10,9 +10,10 @@ import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scm_world._arguments import finite_numbers, one_of, true_or_false
-from scm_world._patterns import as_names, fitting, is_pattern
+from scm_world._arguments import finite_numbers, one_of, true_or_false, whole_number
+from scm_world._patterns import as_names, fits, fitting, is_pattern
 from scm_world._types import Floats, Observation
+from scm_world.env.history import History
 from scm_world.env.pictures import Pixels
 from scm_world.env.vector import KEYPOINTS, WIDE, ObservedPart, Vector, bounds, spread
 from scm_world.errors import InterventionError, UnknownOption
@@ -99,23 +100,56 @@ class GoalVectors:
 MODES = ("structured", "full", "pixel", "custom")
 CONTEXTS = ("none", "observation", "privileged")
 
+LONGEST = 1_000
+"""Most pairs of a history."""
+
+EVERY = ("*",)
+"""The pattern of all parameters."""
+
 FAILED = "failed"
 """What ``info`` calls an episode that ends since its world failed, with ``on_failure``."""
 
 
+def context_of(given: Any) -> tuple[str, tuple[str, ...]]:
+    """Return where the option ``context`` has parameters, and their names and patterns.
+
+    Example:
+        >>> context_of("privileged"), context_of({"privileged": "*.mass"})
+        (('privileged', ('*',)), ('privileged', ('*.mass',)))
+    """
+    if isinstance(given, str) and given in CONTEXTS:
+        return given, EVERY
+    mode, names = "observation", given
+    if isinstance(given, Mapping):
+        (mode, names) = next(iter(given.items()), ("", ()))
+    wanted = as_names(names) if isinstance(names, Iterable) else ()
+    is_text = bool(wanted) and all(isinstance(name, str) for name in wanted)
+    if not is_text or mode not in CONTEXTS[1:] or (isinstance(given, Mapping) and len(given) > 1):
+        allowed = (*CONTEXTS, "names or patterns of parameters", "{'privileged': names}")
+        raise UnknownOption("context", given, allowed)
+    return mode, wanted
+
+
 def check_options(how: Mapping[str, Any]) -> None:
     """Refuse options of an observation that do not exist, or do not go together."""
-    mode, context, keypoints = how["observation_mode"], how["context"], how["keypoints"]
+    mode, keypoints = how["observation_mode"], how["keypoints"]
     one_of("observation_mode", mode, MODES)
-    one_of("context", context, CONTEXTS)
-    for option in ("normalize_actions", "normalize_observations", "goal_env", "stack_images"):
+    context, _ = context_of(how["context"])
+    flags = ("normalize_actions", "normalize_observations", "goal_env")
+    for option in (*flags, "stack_images", "stack_history"):
         true_or_false(option, how[option])
+    steps = whole_number("history", how["history"], least=0, most=LONGEST)
+    if how["stack_history"] and not steps:
+        raise UnknownOption("stack_history", True, ("False without history", "True with history=k"))
     if keypoints is not False:
         one_of("keypoints", keypoints, ("view",))
     if bool(as_names(how["observe"])) != (mode == "custom"):
         allowed = ("names with observation_mode='custom'", "nothing in the other modes")
         raise UnknownOption("observe", how["observe"], allowed)
     pictures = mode == "pixel"
+    if pictures and steps:
+        stacks = "0 with pictures: gymnasium.wrappers.FrameStackObservation(env, k) stacks them"
+        raise UnknownOption("history", steps, (stacks,))
     if pictures and (how["include"] or keypoints or context == "observation"):
         raise UnknownOption("appendix of a picture", "numbers", ("context='privileged'",))
     if how["pad"] is not None and (pictures or keypoints):
@@ -135,13 +169,18 @@ class Observer:
         declaration: The compiled structure.
         how: The options of the environment; see ``ScmWorldEnv``.
         largest: The structure whose bodies have places in the vector.
+        ends: The least and the greatest number of each part of an action.
 
     Attributes:
         goals: Those of the structure, if it has some.
         names: The variables that the observation is made of.
         parts: The observed variables, by name, except goals.
         space: In which all observations lie.
-        observe: Given the present values of one world or of several, the observation.
+        layout: Where each variable stands in the vector, and with ``history`` in each of its pairs.
+        history: Empty, with which the last pairs are observed; None without ``history``.
+        observe: Given the present values of one world or of several, the observation without its
+            ``history``.
+        appended: The parameters that the option ``context`` adds to the vector.
         needed: The variables that have to be computed.
         together: Whether several worlds can be observed in one call.
         outcomes: Columns of reward, end of the episode, success and fractional success; None of
@@ -154,6 +193,7 @@ class Observer:
         declaration: CompiledTask,
         how: Mapping[str, Any],
         largest: CompiledTask,
+        ends: tuple[Floats, Floats],
     ) -> None:
         self.goals = GoalVectors(declaration) if declaration.task.goal.achieved else None
         if how["goal_env"]:
@@ -166,17 +206,24 @@ class Observer:
         else:
             self._main = _vector(world, declaration, how, largest)
         self.parts: dict[str, Vector | Pixels] = {"observation": self._main}
-        if how["context"] == "privileged":
-            about = _parts(world, largest, _context(largest), sensed=False)
+        self.appended = self._main.appended if isinstance(self._main, Vector) else ()
+        if context_of(how["context"])[0] == "privileged":
+            about = _parts(world, largest, _context(largest, how), sensed=False)
             self.parts["context"] = Vector(world, declaration, about, how)
         self._shown = self.goals if how["goal_env"] else None
-        self.space: gymnasium.Space[Any] = self._main.space
         self.observe: Callable[[Rows], Observation] = self._main.observe
         if len(self.parts) > 1 or self._shown is not None:
             self.observe = self._by_name
-            spaces: dict[str, Any] = {name: part.space for name, part in self.parts.items()}
-            shown = {} if self._shown is None else self._shown.spaces
-            self.space = gymnasium.spaces.Dict({**spaces, **shown})
+        spaces: dict[str, Any] = {name: part.space for name, part in self.parts.items()}
+        self.layout, self.history = self._main.layout, None
+        if steps := how["history"]:
+            shown = self._main.space, self.layout
+            self.history = History(*shown, ends, steps, stacked=bool(how["stack_history"]))
+            spaces, self.layout = spaces | self.history.spaces, self.history.layout
+        spaces |= {} if self._shown is None else self._shown.spaces
+        self.space: gymnasium.Space[Any] = spaces["observation"]
+        if len(spaces) > 1:
+            self.space = gymnasium.spaces.Dict(spaces)
         where, terms = declaration.where, declaration.task.weights
         listed = (REWARD, TERMINATED, *terms, FRACTION, SUCCESS)
         columns = {name: where[name].start for name in listed if name in where}
@@ -239,10 +286,14 @@ def _check_goals(declaration: CompiledTask, goals: GoalVectors | None) -> None:
         raise UnknownOption("goal_env", True, (f"False: {allowed}",))
 
 
-def _context(declaration: CompiledTask) -> list[str]:
-    """List every parameter that an intervention can set: masses, frictions, sizes and goals."""
-    model = declaration.model
-    return [name for name in declaration.static_names if model.declared(name).settable]
+def _context(declaration: CompiledTask, how: Mapping[str, Any]) -> list[str]:
+    """List the parameters of a context: an intervention can set them."""
+    model, (_, wanted) = declaration.model, context_of(how["context"])
+    known = [name for name in declaration.static_names if model.declared(name).settable]
+    for one in wanted if wanted != EVERY else ():
+        if not any(fits(name, (one,)) for name in known):
+            raise UnknownOption("context", one, (*CONTEXTS, *known))
+    return [name for name in known if fits(name, wanted)]
 
 
 def published(world: Simulation, declaration: CompiledTask) -> dict[str, Observed]:
@@ -287,8 +338,8 @@ def _vector(
             raise UnknownOption("keypoints", how["keypoints"], allowed)
         reach = np.full(view[1], 4.0)  # [m], [rad]
         parts.append(ObservedPart(KEYPOINTS, -reach, reach))
-    if how["context"] == "observation":
-        rest = [name for name in _context(largest) if name not in names]
+    if context_of(how["context"])[0] == "observation":
+        rest = [name for name in _context(largest, how) if name not in names]
         parts += _parts(world, largest, rest, sensed=False)
     return Vector(world, declaration, parts, how, view)
 

@@ -135,6 +135,9 @@ class TensorEnvs:
         self._observe: Any = vector.on_columns(made)
         self._limit, self._scale = lead.limit, lead.reward_scale
         self._actions = lead.actions.with_arrays(made)
+        self._every, self._history = made(self._all), None
+        if envs._history is not None:
+            self._history = envs._history.on(made(envs._history.rows).clone())
         self._state, self._clock = compiled.state_size, compiled.clock
         self._reward, self._ended, *about = observer.outcomes
         facts = zip((SUCCESS, FRACTION), about, strict=True)
@@ -195,6 +198,9 @@ class TensorEnvs:
         for noise in self._noises.values():
             noise[2] = bool(numbers[:, noise[0]].any())
         seen = self._observe(table[:, rows], self._drawn(STREAM, rows)).float()
+        if self._history is not None:
+            self._history.rows[rows, : seen.shape[1]] = seen
+            seen = self._history.rows[rows]
         if len(rows) == len(self._all):
             self.seen, self._origin = seen, actions.clone()
         else:
@@ -229,6 +235,7 @@ class TensorEnvs:
         """
         torch, rows, table = self._torch, self._rows, self._rows.table
         given, how = actions.to(table.device, torch.float64), self._actions
+        taken = how.in_space(given).float()
         if how.relative:
             given = how.moved(given, self._origin.T)
         summand, factor, low, high = how.scale
@@ -252,6 +259,13 @@ class TensorEnvs:
         rewards[failed], terminated[failed], truncated[failed] = 0.0, False, True
         self._where[np.setdiff1d(self._all, [*reasons]), 2] += np.uint64(1)
         self.seen = self._observe(table, self._drawn(STREAM, self._all)).float()
+        if self._history is not None:
+            moved = self._every
+            if reasons:
+                moved = torch.as_tensor(np.setdiff1d(self._all, [*reasons]), device=table.device)
+            self._history.push(moved, taken[moved])
+            self._history.rows[:, : self._history.size] = self.seen
+            self.seen = self._history.rows.clone()
         over, sound = terminated | truncated, rewards.isfinite()
         flags = torch.stack([over.any(), ~sound.all()])
         self.copies["flags to the host"] += flags.nbytes
@@ -304,6 +318,10 @@ class TensorEnvs:
     def _to_host(self, rows: Integers) -> None:
         self._rows.to_host(rows)
         self._engine.collect(rows)
+        if self._history is not None and self._envs._history is not None:
+            past = self._history.rows[rows].cpu().numpy()
+            self._envs._history.rows[rows] = past
+            self.copies["histories to the host"] += past.nbytes
 
     def _to_device(self, rows: Integers) -> None:
         self.why_not = self._reason(rows)
@@ -313,6 +331,10 @@ class TensorEnvs:
             return
         self._rows.to_device(rows)
         self._engine.write(rows)
+        if self._history is not None and self._envs._history is not None:
+            past = self._envs._history.rows[rows]
+            self._history.rows[rows] = self._torch.as_tensor(past, device=self._rows.table.device)
+            self.copies["histories to the device"] += past.nbytes
         self._look(rows)
 
     def leave(self) -> None:

@@ -130,6 +130,7 @@ class Vector:
     Attributes:
         names: The variables that have to be computed.
         layout: Where each part stands.
+        appended: The parts that the noise of the sensors does not reach: parameters.
         space: In which the observation lies.
         together: Whether several worlds can be observed in one call.
     """
@@ -146,6 +147,7 @@ class Vector:
         sizes = [part.low.size for part in parts]
         ends = zip(parts, np.cumsum(sizes).tolist(), strict=True)
         self.layout = {part.name: slice(end - part.low.size, end) for part, end in ends}
+        self.appended = tuple(part.name for part in parts if not part.sensed)
         where, options = declaration.where, world.options
         self.names = tuple(part.name for part in parts if part.name in where)
         self.names += () if view is None else view[0]
@@ -239,6 +241,12 @@ class Vector:
         if self._view is not None:
             given[KEYPOINTS] = self._view[2](values)
         return self._of(np.concatenate([np.ravel(given[name]) for name in self.layout]))
+
+    def numbers(self, observation: ArrayLike) -> Floats:
+        """Return what the first numbers of an observation show, in SI units, shape (n,)."""
+        _, _, gain, offset, shifts, _ = self._scales
+        shown = np.asarray(observation, np.float64)[: gain.size]
+        return np.asarray((shown - offset) / gain - shifts)
 
     def _of(self, raw: Floats) -> NDArray[np.float32]:
         """Observe the numbers themselves, shape (n,)."""

@@ -2,8 +2,11 @@
 
 A safetensors file has the tensors ``layers.<i>.weight`` (outputs, inputs) and ``layers.<i>.bias``,
 from the observation to the action, each followed by the memory if there is one; it may have
-``log_std``, and ``value.layers.<i>…`` of a second network for the value of the state. Its metadata
-has a ``PolicyAbout`` under ``"scm_world"``.
+``log_std``, and ``value.layers.<i>…`` of a second network for the value of the state. Of a
+recurrent policy an LSTM comes before the layers: ``lstm.0`` takes the observation, ``lstm.1`` the
+output of the step before; both give the input, forget, cell and output gates, one after another, as
+in torch. Its value may have ``value.lstm``. The metadata has a ``PolicyAbout`` under
+``"scm_world"``.
 
 An archive of Stable-Baselines 2 is a zip file. Its member ``parameters`` is a numpy archive of
 plain arrays; its member ``data`` holds pickled Python objects and is never opened. Reading a file
@@ -35,11 +38,11 @@ import numpy as np
 import safetensors.numpy
 from numpy.typing import NDArray
 
-from scm_world._arguments import true_or_false, typed
+from scm_world._arguments import true_or_false, typed, whole_number
 from scm_world._types import ArrayLike, Floats
 from scm_world.errors import ActionError, ModelError, UnknownOption, reading
 from scm_world.geometry.numbers import njit
-from scm_world.policies.cards import KEY, PolicyAbout
+from scm_world.policies.cards import ANY, HISTORY, KEY, PolicyAbout
 from scm_world.runs.files import Location, located, read_arrays, read_bytes, write_whole
 from scm_world.tasks import tasks
 
@@ -47,7 +50,10 @@ Weights = NDArray[np.float32]
 Observed = ArrayLike | Mapping[str, ArrayLike]
 """An observation, or a batch of some: one array, or arrays by name."""
 
-_ANY = PolicyAbout(task="any")  # tanh, clip, one array
+NETWORKS = ("layers", "value.layers", "lstm", "value.lstm")
+"""Names of the networks in a file."""
+
+_ANY = PolicyAbout(task=ANY)  # tanh, clip, one array
 _SAVED = "give a file that scm_world.policies.save_policy has written"
 _ARCHIVE = "only multilayer perceptrons of PPO2 (MlpPolicy) can be loaded"
 _ENV = (
@@ -75,6 +81,8 @@ class MlpPolicy:
         log_std: Logarithm of the standard deviations of the actions, shape (n,), if known.
         value: The layers of the network for the value of the state, if known.
         made_for: Metadata of its training, if known.
+        lstm: The two layers of an LSTM before these layers, of a recurrent policy.
+        value_lstm: Likewise of the value.
 
     Raises:
         ModelError: Layers do not fit one another, or are no finite numbers; all problems.
@@ -84,18 +92,29 @@ class MlpPolicy:
     log_std: Weights | None = field(default=None, repr=False)
     value: tuple[Layer, ...] = field(default=(), repr=False)
     made_for: PolicyAbout | None = None
+    lstm: tuple[Layer, ...] = field(default=(), repr=False)
+    value_lstm: tuple[Layer, ...] = field(default=(), repr=False)
 
     def __post_init__(self) -> None:
         kind = tasks().get(self.about.task)
         wanted = None if kind is None else kind.n_actions
         memory = self.about.memory
-        problems = [*_misfits("layers", self.layers, None, wanted and wanted + memory)]
+        problems = [*_lstm_misfits("lstm", self.lstm)]
+        width = len(self.lstm[1].weight) if self.lstm and not problems else None
+        problems += _misfits("layers", self.layers, width, wanted and wanted + memory)
         if memory and not problems and min(self.n_observed, self.n_actions) < 1:
             problems = [f"layers: too narrow for a memory of {memory} numbers"]
         if memory and (self.value or self.log_std is not None):
             problems.append("a policy with a memory has neither log_std nor value.layers")
+        if memory and self.lstm:
+            problems.append("a policy with an LSTM has no other memory")
         if self.value and not problems:
-            problems = [*_misfits("value.layers", self.value, self.n_observed, 1)]
+            problems = [*_lstm_misfits("value.lstm", self.value_lstm)]
+            if bool(self.lstm) != bool(self.value_lstm):
+                problems.append("lstm and value.lstm: one is there without the other")
+        if self.value and not problems:
+            first = len(self.value_lstm[1].weight) if self.lstm else self.n_observed
+            problems = [*_misfits("value.layers", self.value, first, 1)]
         if self.log_std is not None and not problems:
             shape = (self.n_actions,)
             if self.log_std.shape != shape or not np.isfinite(self.log_std).all():
@@ -111,12 +130,17 @@ class MlpPolicy:
     @property
     def n_observed(self) -> int:
         """Number of components of an observation."""
-        return int(self.layers[0].weight.shape[0]) - self.about.memory
+        return int((self.lstm or self.layers)[0].weight.shape[0]) - self.about.memory
 
     @property
     def n_actions(self) -> int:
         """Number of components of an action."""
         return int(self.layers[-1].weight.shape[1]) - self.about.memory
+
+    @property
+    def n_remembered(self) -> int:
+        """Number of components of its state from step to step: of a memory, or of an LSTM."""
+        return 2 * len(self.lstm[1].weight) if self.lstm else self.about.memory
 
     def __call__(
         self, observation: Observed, *, generator: np.random.Generator | None = None
@@ -144,40 +168,84 @@ class MlpPolicy:
 
     def mean(self, observation: Observed) -> Floats:
         """Compute the mean before it is bounded, shape (..., n_actions); errors as above."""
-        if self.about.memory:
+        if self.n_remembered:
             advice = "call policy.predict(observation, state=…, episode_start=…)"
             raise ActionError(f"the policy has a memory; {advice}", None)
-        return self._computed(self.layers, self.joined(observation))
+        return self._computed("layers", self.joined(observation))
 
     def values(self, observation: Observed) -> Floats:
         """Compute the value of the state, shape (..., 1).
 
         Raises:
             ActionError: As above.
-            UnknownOption: The network of the value is not known.
+            UnknownOption: The network of the value is not known, or is recurrent.
         """
-        if not self.value:
-            raise UnknownOption("policy", self, ("one with a value network",))
-        return self._computed(self.value, self.joined(observation))
+        if not self.value or self.value_lstm:
+            raise UnknownOption("policy", self, ("one with a value network that is not recurrent",))
+        return self._computed("value.layers", self.joined(observation))
 
-    def _computed(self, layers: tuple[Layer, ...], seen: NDArray[Any]) -> Floats:
-        x = np.ascontiguousarray(seen.reshape(-1, len(layers[0].weight)), dtype=np.float64)
-        doubles = self._doubles[layers is self.value]
+    def hidden(self, observation: Observed, state: ArrayLike | None = None) -> Floats:
+        """Compute the activations of the last hidden layer, shape (..., k).
+
+        Where there is no hidden layer it is the input of the only layer.
+
+        Args:
+            observation: As above.
+            state: The memory before this observation, as in ``predict``.
+
+        Raises:
+            ActionError: As in ``predict``.
+        """
+        return self._computed("layers", self._inputs(observation, state)[0], stop=-1)
+
+    def untrained(self, seed: int = 0) -> MlpPolicy:
+        """Return a policy of equal shapes and metadata whose weights are random.
+
+        A weight is normal, with the standard deviation ``1 / sqrt(inputs)``; a bias is 0.
+        """
+        rng = np.random.default_rng(whole_number("seed", seed, least=0))
+        tensors = {
+            name: np.zeros_like(tensor)
+            if tensor.ndim == 1
+            else (rng.normal(size=tensor.shape) / math.sqrt(tensor.shape[1])).astype(np.float32)
+            for name, tensor in self.tensors().items()
+        }
+        return self.of(tensors, self.made_for)
+
+    def _computed(self, name: str, seen: NDArray[Any], stop: int | None = None) -> Floats:
+        layers = self._doubles[name]
+        x = np.ascontiguousarray(seen.reshape(-1, len(layers[0][0])), dtype=np.float64)
         hidden = 1 if self.about.activation == "tanh" else 2
-        for number, (weight, bias) in enumerate(doubles, start=1):
+        for number, (weight, bias) in enumerate(layers[:stop], start=1):
             x = _dense(x, weight, bias, hidden if number < len(layers) else 0)
         return x.reshape(*seen.shape[:-1], x.shape[1])
 
+    def _recurrent(self, seen: NDArray[Any], state: Floats) -> tuple[Floats, Floats]:
+        """Return the output of the LSTM, and its next state: output and cell, (..., 2 hidden)."""
+        rows = np.ascontiguousarray(state.reshape(-1, state.shape[-1]))
+        x = np.ascontiguousarray(seen.reshape(len(rows), -1), dtype=np.float64)
+        (weight, bias), (back, more) = self._doubles["lstm"]
+        gates = _dense(x, weight, bias, 0)
+        gates += _dense(np.ascontiguousarray(rows[:, : len(back)]), back, more, 0)
+        found = _gated(gates, rows).reshape(state.shape)
+        return found[..., : len(back)], found
+
     @cached_property
-    def _doubles(self) -> list[list[tuple[Floats, Floats]]]:
-        """The layers of the actions and of the value, as 64-bit floats."""
-        return [
-            [
+    def _doubles(self) -> dict[str, list[tuple[Floats, Floats]]]:
+        """The layers of each network, as 64-bit floats."""
+        return {
+            name: [
                 (np.ascontiguousarray(weight, np.float64), bias.astype(np.float64))
-                for weight, bias in of
+                for weight, bias in layers
             ]
-            for of in (self.layers, self.value)
-        ]
+            for name, layers in self._networks.items()
+        }
+
+    @property
+    def _networks(self) -> dict[str, tuple[Layer, ...]]:
+        """The layers of each network, by its name in a file."""
+        found = self.layers, self.value, self.lstm, self.value_lstm
+        return dict(zip(NETWORKS, found, strict=True))
 
     def joined(self, observation: Observed) -> NDArray[Any]:
         """Join the parts of an observation, shape (..., n); errors as above."""
@@ -188,7 +256,11 @@ class MlpPolicy:
                 raise ActionError(
                     f"the policy observes {wanted}, got the parts {[*observation]}; {_ENV}", None
                 )
-            seen = np.concatenate([np.asarray(observation[name]) for name in inputs], axis=-1)
+            arrays = {name: np.asarray(observation[name]) for name in inputs}
+            if HISTORY in inputs and arrays[HISTORY].ndim > 1:  # a row for each step
+                past = arrays[HISTORY]
+                arrays[HISTORY] = past.reshape(*past.shape[:-2], -1)
+            seen = np.concatenate([*arrays.values()], axis=-1)
         elif inputs is not None:
             raise ActionError(f"the policy observes the parts {[*inputs]} by name; {_ENV}", None)
         else:
@@ -215,18 +287,19 @@ class MlpPolicy:
         state: ArrayLike | None = None,
         episode_start: ArrayLike | None = None,
         deterministic: bool = True,
-    ) -> tuple[Weights, Weights | None]:
+    ) -> tuple[Weights, NDArray[Any] | None]:
         """Choose the action, with the signature of Stable-Baselines3.
 
         Args:
             observation: As above.
-            state: The memory that the last call returned, shape (..., memory); None: it is empty.
+            state: The memory that the last call returned, shape (..., n_remembered); None: it is
+                empty.
             episode_start: Whether it is emptied first, a truth value or shape (...); not if None.
             deterministic: Must be true; draws need a generator: ``policy(…, generator=…)``.
 
         Returns:
-            The action, shape (..., n_actions), and the memory, of the values -1 and 1; None if the
-            policy has none.
+            The action, shape (..., n_actions), and the memory: the values -1 and 1, or output and
+            cell of an LSTM in 64-bit floats; None if the policy has none.
 
         Raises:
             ActionError: As above, or the memory has another shape.
@@ -234,28 +307,42 @@ class MlpPolicy:
         """
         if not true_or_false("deterministic", deterministic):
             raise UnknownOption("deterministic", deterministic, ("True",))
-        if not self.about.memory:
+        if not self.n_remembered:
             return self(observation), None
+        given, kept = self._inputs(observation, state, episode_start)
+        found = self._computed("layers", given)
+        if self.lstm:
+            return self._bounded(found), kept
+        action, said = np.split(found, [self.n_actions], axis=-1)
+        return self._bounded(action), np.where(said > 0.0, 1.0, -1.0).astype(np.float32)
+
+    def _inputs(
+        self,
+        observation: Observed,
+        state: ArrayLike | None = None,
+        episode_start: ArrayLike | None = None,
+    ) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return the input of the layers, and the memory, of an LSTM after this observation."""
         seen = self.joined(observation)
-        shape = (*seen.shape[:-1], self.about.memory)
+        shape = (*seen.shape[:-1], self.n_remembered)
         try:
             kept = np.zeros(shape) if state is None else np.array(state, np.float64)
             first = np.asarray(False if episode_start is None else episode_start, bool)
             first = first.reshape(shape[:-1] if first.size > 1 else ())
         except (TypeError, ValueError) as error:
             raise ActionError(f"no memory of shape {shape}: {error}", None) from None
-        if kept.shape != shape or not np.isin(kept, (-1.0, 0.0, 1.0)).all():
-            wanted = f"the memory has shape {shape} and the values -1, 0 and 1"
+        fits = np.isfinite(kept) if self.lstm else np.isin(kept, (-1.0, 0.0, 1.0))
+        if kept.shape != shape or not fits.all():
+            values = "finite numbers" if self.lstm else "the values -1, 0 and 1"
+            wanted = f"the memory has shape {shape} and {values}"
             raise ActionError(f"{wanted}, got {np.array(state)}", None)
         kept[np.broadcast_to(first, shape[:-1])] = 0.0
-        found = self._computed(self.layers, np.concatenate([seen, kept], axis=-1))
-        action, said = np.split(found, [self.n_actions], axis=-1)
-        return self._bounded(action), np.where(said > 0.0, 1.0, -1.0).astype(np.float32)
+        return self._recurrent(seen, kept) if self.lstm else (np.append(seen, kept, axis=-1), kept)
 
     def tensors(self) -> dict[str, Weights]:
         """Return the tensors of a file, by name."""
         found: dict[str, Weights] = {}
-        for prefix, layers in (("layers", self.layers), ("value.layers", self.value)):
+        for prefix, layers in self._networks.items():
             for number, (weight, bias) in enumerate(layers):
                 found[f"{prefix}.{number}.weight"] = np.ascontiguousarray(weight.T)
                 found[f"{prefix}.{number}.bias"] = np.ascontiguousarray(bias)
@@ -295,20 +382,21 @@ class MlpPolicy:
             for name, array in tensors.items()
             if not isinstance(array, np.ndarray) or array.dtype != np.float32
         ]
-        left, networks = dict(tensors), []
-        for prefix in ("layers", "value.layers"):
+        left, networks = dict(tensors), dict[str, tuple[Layer, ...]]()
+        for prefix in NETWORKS:
             layers: list[Layer] = []
             while (name := f"{prefix}.{len(layers)}.weight") in left:
                 bias = f"{prefix}.{len(layers)}.bias"
                 if bias not in left:
                     raise ModelError([f"the tensor {bias!r} is missing"])
                 layers.append(Layer(left.pop(name).T, left.pop(bias)))
-            networks.append(tuple(layers))
+            networks[prefix] = tuple(layers)
         log_std = left.pop("log_std", None)
         wrong += [f"{name!r} is not a tensor of a policy" for name in left]
         if wrong:
             raise ModelError(wrong)
-        return cls(networks[0], log_std, networks[1], made_for)
+        mean, value, *lstms = networks.values()
+        return cls(mean, log_std, value, made_for, *lstms)
 
 
 @typed
@@ -421,6 +509,41 @@ def _misfits(
         width = outputs
     if layers and last not in (None, width):
         yield f"{name}: the last one has to give {last} numbers, not {width}"
+
+
+def _lstm_misfits(name: str, lstm: tuple[Layer, ...]) -> Iterator[str]:
+    """Name the problems of the two layers of an LSTM, if there is one."""
+    n = np.shape(lstm[1].weight)[:1] if len(lstm) == 2 else ()
+    width = 4 * n[0] if n else 0
+    is_good = width > 0 and np.ndim(lstm[0].weight) == np.ndim(lstm[1].weight) == 2
+    for weight, bias in lstm:
+        is_good = is_good and weight.shape[1:] == np.shape(bias) == (width,)
+        is_good = is_good and bool(np.isfinite(weight).all() and np.isfinite(bias).all())
+    if lstm and not is_good:
+        given = [(np.shape(weight)[::-1], np.shape(bias)) for weight, bias in lstm]
+        yield (
+            f"{name}: expected two layers of finite numbers, with weights (4 n, inputs) and "
+            f"(4 n, n) and biases (4 n,), got {given}"
+        )
+
+
+@njit(cache=True)
+def _gated(gates: Floats, state: Floats) -> Floats:
+    """Compute output and cell of an LSTM, shape (rows, 2 n), from its gates, shape (rows, 4 n)."""
+    found = np.empty_like(state)
+    n = state.shape[1] // 2
+    for row in range(len(state)):
+        for j in range(n):
+            entry, forget = _sigmoid(gates[row, j]), _sigmoid(gates[row, n + j])
+            cell = forget * state[row, n + j] + entry * math.tanh(gates[row, 2 * n + j])
+            found[row, j] = _sigmoid(gates[row, 3 * n + j]) * math.tanh(cell)
+            found[row, n + j] = cell
+    return found
+
+
+@njit(cache=True)
+def _sigmoid(x: float) -> float:
+    return 0.5 * (1.0 + math.tanh(0.5 * x))
 
 
 @njit(cache=True)

@@ -13,7 +13,7 @@ from typing import Any, final
 import gymnasium
 import numpy as np
 
-from scm_world._arguments import missing
+from scm_world._arguments import load, missing
 from scm_world._types import Floats
 from scm_world.env.observer import FAILED
 from scm_world.errors import (
@@ -27,11 +27,12 @@ from scm_world.queries.progress import Progress, Tell
 from scm_world.runs.files import make_folder, read_arrays
 from scm_world.runs.study import Study
 from scm_world.training.export import begin_with, exported
+from scm_world.training.logs import Log
 from scm_world.training.recipe import Recipe
 from scm_world.training.rounds import Rounds, restore_last
 from scm_world.training.sb3 import Sb3VecEnv
-from scm_world.training.settings import Rate
-from scm_world.training.worlds import SEEDS, SUCCESS, make_envs, scales
+from scm_world.training.settings import Ppo, Rate
+from scm_world.training.worlds import SEEDS, SUCCESS, actor_columns, make_envs, scales
 
 try:
     import stable_baselines3
@@ -39,10 +40,11 @@ try:
     import torch
     from stable_baselines3.common.base_class import BaseAlgorithm
     from stable_baselines3.common.callbacks import BaseCallback
-    from stable_baselines3.common.logger import Logger, make_output_format
+    from stable_baselines3.common.logger import KVWriter, Logger, make_output_format
     from stable_baselines3.common.noise import NormalActionNoise
+    from stable_baselines3.common.policies import ActorCriticPolicy
     from stable_baselines3.common.save_util import load_from_zip_file, recursive_setattr
-    from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+    from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, MlpExtractor
     from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 except ImportError as error:
     raise missing(error, "stable_baselines3", "stable-baselines3", "train") from error
@@ -80,9 +82,11 @@ class Episodes(VecMonitor):
         return seen
 
 
-def make_worlds(recipe: Recipe, *, backend: str, threads: int | None = None) -> Episodes:
+def make_worlds(
+    recipe: Recipe, *, backend: str, threads: int | None = None, seed: int = 0
+) -> Episodes:
     """Make the worlds of a recipe for Stable-Baselines3; see ``make_envs``."""
-    envs = make_envs(recipe, backend=backend, threads=threads)
+    envs = make_envs(recipe, backend=backend, threads=threads, seed=seed)
     try:
         vec_env = Sb3VecEnv(envs, [])
         (there,) = vec_env.get_attr("info_shapes", 0)
@@ -112,16 +116,49 @@ class Scaled(BaseFeaturesExtractor):
         return observations.float() * self.scale
 
 
+@final
+class Columns(torch.nn.Module):
+    """Some of the numbers of an observation."""
+
+    def __init__(self, columns: Any) -> None:
+        super().__init__()
+        self.register_buffer("which", torch.as_tensor(columns), persistent=False)
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        """Choose them from a batch of observations."""
+        return observations[:, self.which]
+
+
+@final
+class BlindActor(ActorCriticPolicy):
+    """A policy of which the actor observes some numbers only, and the critic all."""
+
+    def __init__(self, *given: Any, columns: Any, **options: Any) -> None:
+        self.columns = columns
+        super().__init__(*given, **options)
+
+    def _build_mlp_extractor(self) -> None:
+        super()._build_mlp_extractor()
+        how = self.net_arch, self.activation_fn, self.device
+        body = MlpExtractor(len(self.columns), *how).policy_net
+        self.mlp_extractor.policy_net = torch.nn.Sequential(Columns(self.columns), *body)
+
+
 def make_learner(
     recipe: Recipe, worlds: Episodes, *, seed: int, device: str = "cpu"
 ) -> BaseAlgorithm:
-    """Make the algorithm of a recipe: a ``PPO``, ``SAC`` or ``TD3`` of Stable-Baselines3."""
+    """Make the algorithm of a recipe: ``PPO``, ``SAC``, … of Stable-Baselines3."""
     network, settings = recipe.network, recipe.settings.model_dump()
     policy: dict[str, Any] = {
         "net_arch": list(network.hidden),
         "activation_fn": {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}[network.activation],
     }
-    if recipe.algo == "ppo":
+    library, kind, suffix = stable_baselines3, recipe.algo.upper(), "Policy"
+    if recipe.algo == "recurrent_ppo":
+        library = load("sb3_contrib", "sb3-contrib", "train")
+        kind, suffix = "RecurrentPPO", "LstmPolicy"
+        policy["lstm_hidden_size"] = network.recurrent
+    if isinstance(recipe.settings, Ppo):
         policy |= {"log_std_init": network.log_std, "ortho_init": network.orthogonal}
     if network.scaled:
         (layout,) = worlds.get_attr("layout", 0)
@@ -142,8 +179,12 @@ def make_learner(
     if recipe.scale_rewards:
         env = VecNormalize(worlds, norm_obs=False, gamma=settings["gamma"])
     is_dict = hasattr(worlds.observation_space, "spaces")
-    model = getattr(stable_baselines3, recipe.algo.upper())(
-        "MultiInputPolicy" if is_dict else "MlpPolicy",
+    networks: Any = ("MultiInput" if is_dict else "Mlp") + suffix
+    if recipe.observations == "critic":
+        (layout,), (appended,) = worlds.get_attr("layout", 0), worlds.get_attr("appended", 0)
+        networks, policy["columns"] = BlindActor, actor_columns(recipe, layout, appended)
+    model = getattr(library, kind)(
+        networks,
         env,
         learning_rate=rate_of(recipe.rate),
         policy_kwargs=policy,
@@ -242,7 +283,7 @@ def restore(model: BaseAlgorithm, content: bytes, steps: int, memory: Path) -> s
     for name, tensor in (variables or {}).items():
         recursive_setattr(model, f"{name}.data", tensor.data.to(model.device))
     model.num_timesteps = steps
-    if isinstance(model, stable_baselines3.PPO) and not callable(model.learning_rate):
+    if hasattr(model, "clip_range") and not callable(model.learning_rate):
         model.learning_rate = model.policy.optimizer.param_groups[0]["lr"]  # it may adapt
         model._setup_lr_schedule()
     if not _remembered(model):
@@ -269,7 +310,7 @@ def opened(
     recipe: Recipe, *, backend: str, seed: int, device: str, threads: int | None
 ) -> Iterator[tuple[BaseAlgorithm, Any]]:
     """Make the algorithm of a recipe with its worlds; yield it, and one of them."""
-    with closing(make_worlds(recipe, backend=backend, threads=threads)) as worlds:
+    with closing(make_worlds(recipe, backend=backend, threads=threads, seed=seed)) as worlds:
         (world,) = worlds.get_attr("world", 0)
         yield make_learner(recipe, worlds, seed=seed, device=device), world
 
@@ -284,10 +325,13 @@ def learn(
     progress: Progress | None,
     tell: Tell,
     begun: bool,
+    log: Log,
+    callback: BaseCallback | None,
+    tensorboard: bool,
 ) -> float | None:
     """Learn the steps that are left since the last checkpoint; return the best score.
 
-    ``begun`` is whether the weights are those of a policy.
+    ``begun`` is whether the weights are those of a policy; ``log`` takes the numbers of each round.
 
     Raises:
         UnwritableFolder: The disk is full, or permission is missing.
@@ -302,11 +346,35 @@ def learn(
         tell(f"{said}: give it with --start; now the weights are random")
     watch = Watch(recipe, study, backend=backend, card=card, progress=progress, tell=tell)
     if recipe.steps > model.num_timesteps:
-        _learn(model, watch, Path(str(study.folder)))
+        folder, before = Path(str(study.folder)), model.num_timesteps
+        outputs = [
+            make_output_format("csv", str(folder), f"-{before}" if before else ""),
+            Numbers(log),
+        ]
+        if tensorboard:
+            place = str(make_folder(folder / "tensorboard"))
+            outputs.append(make_output_format("tensorboard", place))
+        model.set_logger(Logger(str(folder), outputs))
+        _learn(model, watch, callback, folder)
     return watch.score
 
 
-def _learn(model: BaseAlgorithm, watch: Watch, folder: Path) -> None:
+@final
+class Numbers(KVWriter):
+    """Passes the numbers of a round on."""
+
+    def __init__(self, log: Log) -> None:
+        self._log = log
+
+    def write(self, key_values: dict[str, Any], key_excluded: object, step: int = 0) -> None:
+        """Pass them on."""
+        self._log(key_values, step)
+
+    def close(self) -> None:
+        """Leave them to who has opened them."""
+
+
+def _learn(model: BaseAlgorithm, watch: Watch, callback: BaseCallback | None, folder: Path) -> None:
     """Learn the remaining steps; write curves, checkpoints and the policy.
 
     Raises:
@@ -314,15 +382,13 @@ def _learn(model: BaseAlgorithm, watch: Watch, folder: Path) -> None:
         Diverged: Weights are not finite any more.
     """
     recipe, before = watch.recipe, model.num_timesteps
-    outputs = [
-        make_output_format("csv", str(folder), f"-{before}" if before else ""),
-        make_output_format("tensorboard", str(make_folder(folder / "tensorboard"))),
-    ]
-    model.set_logger(Logger(str(folder), outputs))
-    every = 1 if recipe.algo == "ppo" else recipe.worlds  # rounds, or episodes
+    every = 1 if isinstance(recipe.settings, Ppo) else recipe.worlds  # rounds, or episodes
     try:
         model.learn(
-            recipe.steps - before, callback=watch, reset_num_timesteps=False, log_interval=every
+            recipe.steps - before,
+            callback=[watch] if callback is None else [watch, callback],
+            reset_num_timesteps=False,
+            log_interval=every,
         )
     except KeyboardInterrupt:
         watch.save()
@@ -360,6 +426,7 @@ class Watch(BaseCallback):
         self.recipe, self._study, self._card, self._tell = recipe, study, dict(card), tell
         self._over = self._failed = 0  # episodes since the training began or was resumed
         about: dict[str, Any] = {"backend": backend, "progress": progress, "tell": tell}
+        about["seed"] = self._card["seed"]
         self._rounds = Rounds(recipe, study, **about, save=self.save, policy=self._policy)
 
     @property
@@ -384,6 +451,9 @@ class Watch(BaseCallback):
 
     def _on_training_end(self) -> None:
         self._look()
+        steps = self.model.num_timesteps
+        self.logger.record("time/total_timesteps", steps, exclude="tensorboard")
+        self.logger.dump(steps)  # with the last evaluation
         self.save()
         if self._failed:
             where = "env={'on_failure': 'raise'} ends the training there and says why"
@@ -434,7 +504,8 @@ class Watch(BaseCallback):
         """Freeze PPO's policy while only the value is learned; lower its standard deviations."""
         recipe, policy, steps = self.recipe, self.model.policy, self.model.num_timesteps
         if recipe.critic_warmup:
-            for part in (policy.mlp_extractor.policy_net, policy.action_net, policy.log_std):
+            actor = policy.mlp_extractor.policy_net, policy.action_net, policy.log_std
+            for part in (*actor, getattr(policy, "lstm_actor", policy.log_std)):
                 part.requires_grad_(steps >= recipe.critic_warmup)
         if recipe.network.log_std_end is not None:
             first, done = recipe.network.log_std, min(steps / recipe.steps, 1.0)

@@ -18,13 +18,14 @@ from scm_world.errors import (
     UnreadableFile,
     reading,
 )
-from scm_world.evaluation import evaluate
+from scm_world.evaluation import Protocol, evaluate
 from scm_world.policies import MlpPolicy, PolicyAbout, load_policy, save_policy
-from scm_world.policies.cards import FORM, KEY, OPTIONS
+from scm_world.policies.cards import FORM, HISTORY, KEY, OPTIONS
 from scm_world.policies.wrappers import LinearMap, samples, seen_through
 from scm_world.runs.files import read_text, write_whole
 from scm_world.training.recipe import Recipe
 from scm_world.training.settings import Trials
+from scm_world.training.worlds import level_seed
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -70,7 +71,8 @@ def export_sb3(
     environment, and without torch. Actions are compared before anything is written.
 
     Args:
-        model: PPO, A2C, SAC, TD3 or DDPG with a multilayer perceptron of ``Tanh`` or ``ReLU``.
+        model: PPO, A2C, SAC, TD3 or DDPG with a multilayer perceptron of ``Tanh`` or ``ReLU``; or
+            RecurrentPPO of sb3-contrib, with one LSTM for the actions and one for the value.
         env: In which it was trained: an environment, many, or a ``VecEnv`` of either.
         path: The file; it ends in ``.safetensors``.
         card: What else is said of it, as plain data.
@@ -108,10 +110,10 @@ def export_sb3(
         for shown in samples(space):
             observed = shown if seen is None else seen(shown)
             wanted = model.predict(observed, deterministic=True)[0]
-            if not np.allclose(policy(shown), wanted, rtol=1e-3, atol=1e-4):
+            if not np.allclose(policy.predict(shown)[0], wanted, rtol=1e-3, atol=1e-4):
                 raise ValueError("its actions are not those of its linear layers")
     except (AttributeError, KeyError, ValueError, ScmWorldError) as error:
-        kinds = "PPO, A2C, SAC, TD3 or DDPG with a multilayer perceptron of Tanh or ReLU"
+        kinds = "(Recurrent)PPO, A2C, SAC, TD3 or DDPG with a multilayer perceptron of Tanh or ReLU"
         problem = f"the network of the model cannot be written ({error}): give {kinds}"
         raise ModelError([problem]) from error
     return Path(str(save_policy(path, policy)))
@@ -151,7 +153,7 @@ def begin_tensors(
     for name in sorted({*theirs, *ours}):
         if name in theirs and name in ours:
             pairs[f"shape of {name}"] = theirs[name].shape, ours[name].shape
-        elif name.startswith("layers"):
+        elif name.startswith(("layers", "lstm")):
             pairs[name] = name in theirs, name in ours
     wrong = [
         f"{n} is {one!r} there and {two!r} here" for n, (one, two) in pairs.items() if one != two
@@ -179,36 +181,58 @@ def _tensors(model: BaseAlgorithm) -> dict[str, Any]:
             "layers": [body.policy_net, policy.action_net],
             "value.layers": [body.value_net, policy.value_net],
         }
+        if hasattr(policy, "columns"):  # the value observes more
+            del parts["value.layers"]
     found = {}
     for name, networks in parts.items():
         linear = [m for network in networks for m in network.modules() if hasattr(m, "weight")]
         for number, layer in enumerate(linear):
             found[f"{name}.{number}.weight"] = layer.weight
             found[f"{name}.{number}.bias"] = layer.bias
+    for name, lstm in ("lstm", "lstm_actor"), ("value.lstm", "lstm_critic"):
+        if hasattr(policy, lstm):
+            one = getattr(policy, lstm)
+            if one is None or one.num_layers > 1:
+                raise ValueError(f"it has not one layer in {lstm}")
+            for number, part in enumerate(("ih", "hh")):
+                found[f"{name}.{number}.weight"] = getattr(one, f"weight_{part}_l0")
+                found[f"{name}.{number}.bias"] = getattr(one, f"bias_{part}_l0")
     return found if actor is not None else {**found, "log_std": policy.log_std}
 
 
 def _first(tensors: Mapping[str, Any]) -> list[str]:
     """Name the weights that observations meet first."""
-    return [name for name in tensors if name.endswith("layers.0.weight")]
+    first = "lstm.0.weight" if "lstm.0.weight" in tensors else "layers.0.weight"
+    return [name for name in tensors if name.endswith(first)]
 
 
 def _scale(model: BaseAlgorithm) -> Any:
     """Return the factor of observations, which a policy file has in its weights."""
     owner = getattr(model.policy, "actor", model.policy)
     scale = getattr(owner.features_extractor, "scale", None)
-    return np.float32(1.0) if scale is None else scale.cpu().numpy()
+    if scale is None:
+        return np.float32(1.0)
+    return scale.cpu().numpy()[getattr(owner, "columns", slice(None))]
 
 
 def scored(
-    policy: MlpPolicy, task: str, env: Mapping[str, Any], trials: Trials, backend: str
+    policy: MlpPolicy,
+    task: str,
+    env: Mapping[str, Any],
+    trials: Trials,
+    backend: str,
+    **other: Any,
 ) -> tuple[str, dict[str, float]]:
-    """Evaluate a policy while something is trained: the metric, and its means by protocol."""
+    """Evaluate a policy while something is trained: the metric, and its means by protocol.
+
+    ``other`` are arguments of ``evaluate`` in place of those of the trials.
+    """
     form = {name: value for name, value in env.items() if name in (*OPTIONS, "task_options")}
     form["on_failure"] = env.get("on_failure", "truncate")
     protocols = list(trials.protocols)
     given: dict[str, Any] = {"task": task, "n": trials.episodes, "seeds": SEED, "env": form}
-    found = evaluate(policy, protocols, backend=backend, **given)
+    given |= {"protocols": protocols, "backend": backend, **other}
+    found = evaluate(policy, **given)
     metric = found.metric(trials.metric)
     return metric, {name: float(found.score(name, metric).value) for name in found.protocols}
 
@@ -232,8 +256,8 @@ class Evaluations:
         last: The last scores, by protocol.
     """
 
-    def __init__(self, recipe: Recipe, backend: str, folder: Path) -> None:
-        self._recipe, self._folder = recipe, folder
+    def __init__(self, recipe: Recipe, backend: str, folder: Path, seed: int) -> None:
+        self._recipe, self._folder, self._seed = recipe, folder, seed
         self._backend = recipe.trials.backend or backend
         found = [_score_in(path) for path in folder.glob("evaluations/*.json")]
         self.best: float | None = max((one for one in found if one is not None), default=None)
@@ -243,17 +267,30 @@ class Evaluations:
         """Evaluate; write the policy, also as the best one if none was better. Return the words."""
         recipe, folder = self._recipe, self._folder
         how = recipe.task, recipe.options, recipe.trials, self._backend
-        metric, self.last = scored(policy, *how)
-        score = mean(self.last)
-        found = {"steps": steps, "metric": metric, "mean": score, "scores": self.last}
+        metric, scores = scored(policy, *how)
+        score, levels = mean(scores), self._gap(policy) if recipe.levels else {}
+        self.last = {**scores, **levels}
+        found = {"steps": steps, "metric": metric, "mean": score, "scores": scores, **levels}
         save_policy(folder / "policy.safetensors", policy)
         if score is not None and (self.best is None or score > self.best):
             self.best = score
-            about = policy.about.with_card(trial={"steps": steps, "scores": self.last})
+            about = policy.about.with_card(trial={"steps": steps, "scores": scores, **levels})
             save_policy(folder / "best.safetensors", policy, about)
         path = folder / f"evaluations/{steps}.json"
         write_whole(path, json.dumps(found, indent=2))  # at last: a resumed training reads it
         return words(self.last)
+
+    def _gap(self, policy: MlpPolicy) -> dict[str, float]:
+        """Score the policy on levels of the training and on new draws of its curriculum."""
+        recipe, trials = self._recipe, self._recipe.trials
+        how = recipe.task, recipe.options, trials, self._backend
+        drawn = Protocol("curriculum", act=recipe.curriculum)
+        n = min(trials.episodes, recipe.levels or trials.episodes)
+        known: dict[str, Any] = {"seeds": level_seed(self._seed), "n": n}
+        _, old = scored(policy, *how, protocols=[drawn], **known)
+        _, new = scored(policy, *how, protocols=[drawn])
+        found = {"training_levels": old[drawn.name], "new_draws": new[drawn.name]}
+        return {**found, "gap": found["training_levels"] - found["new_draws"]}
 
 
 def _score_in(path: Path) -> float | None:
@@ -285,20 +322,22 @@ def to_onnx(policy: MlpPolicy | Path | str, path: Path | str) -> Path:
 
     Raises:
         MissingExtra: The package onnx is not installed.
-        UnknownOption: The policy has a memory.
+        UnknownOption: The policy has a memory, or is recurrent.
         UnreadableFile: The file is not a policy.
         UnwritableFolder: The disk is full, or permission is missing.
     """
     onnx = load("onnx", "onnx", "train")
     given = policy if isinstance(policy, MlpPolicy) else load_policy(policy)
     about = given.about
-    if about.memory:
-        raise UnknownOption("memory of an ONNX network", about.memory, ("0: none",))
+    if given.n_remembered:
+        raise UnknownOption("memory of an ONNX network", given.n_remembered, ("0: none",))
     seen, nodes = "observation", []
     inputs = [f"float[N, {given.n_observed}] observation"]
     if about.inputs is not None:
-        inputs = [f"{'double' if n in GOALS else 'float'}[N, ?] {n}" for n in about.inputs]
-        nodes += [f"{name}_single = Cast<to = 1>({name})" for name in about.inputs]
+        kinds = {**dict.fromkeys(GOALS, "double[N, ?]"), HISTORY: "float[N, ?, ?]"}
+        inputs = [f"{kinds.get(name, 'float[N, ?]')} {name}" for name in about.inputs]
+        nodes += [f"{name}_flat = Flatten<axis = 1>({name})" for name in about.inputs]
+        nodes += [f"{name}_single = Cast<to = 1>({name}_flat)" for name in about.inputs]
         joined = ", ".join(f"{name}_single" for name in about.inputs)
         seen = "joined"
         nodes.append(f"{seen} = Concat<axis = 1>({joined})")

@@ -1,11 +1,11 @@
-"""Imitation: a network is fitted to demonstrations of a scripted policy or of a recording."""
+"""Imitation: a network is fitted to demonstrations of a scripted or trained policy, or recorded."""
 
 from __future__ import annotations
 
 import copy
 import io
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from hashlib import sha256
@@ -20,16 +20,19 @@ from scm_world._arguments import load, one_of, whole_number
 from scm_world._fingerprint import fingerprint
 from scm_world._types import Floats, Observation
 from scm_world.env import ScmWorldEnv
+from scm_world.env.observer import FAILED, context_of
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
-from scm_world.evaluation.episodes import Hook, play, under
+from scm_world.evaluation.episodes import Hook, in_world, play, under
 from scm_world.evaluation.protocols import chosen, protocols_of
 from scm_world.evaluation.recording import Recording, action_noise
-from scm_world.policies import MlpPolicy, save_policy
+from scm_world.policies import MlpPolicy, as_agent, save_policy
 from scm_world.policies.cards import OPTIONS
 from scm_world.policies.networks import policy_in
-from scm_world.policies.scripted import NAMED
+from scm_world.policies.scripted import NAMED, Policy
+from scm_world.policies.zoo import PREFIX as ZOO
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress, Tell
+from scm_world.queries.world import World
 from scm_world.runs.files import is_there, read_arrays
 from scm_world.runs.pool import Pool
 from scm_world.runs.study import Study
@@ -65,10 +68,14 @@ UNIT = 0.1
 CHANGES = 15.0
 """Weight of the loss where the memory changes, which is seldom."""
 
+SEQUENCE = 32
+"""Control steps through which the loss of a recurrent network is propagated back."""
+
 ONLY: Mapping[str, tuple[Any, ...]] = {
     "normalize_actions": (True,),
     "observation_mode": ("structured", "full", "custom"),
     "context": ("none", "observation"),
+    "stack_history": (False,),
     "goal_env": (False,),
 }
 """Options whose other values give no vector of numbers, or actions that are not in [-1, 1]."""
@@ -83,7 +90,9 @@ class Lesson(Frozen):
 
     Attributes:
         task: Name of the task.
-        teacher: Name of a policy that reads the world's state.
+        teacher: Name of a policy that reads the world's state; or a trained policy, in its own
+            observations, ``"privileged"`` ones for example: its file, the folder of its run, or
+            ``"zoo:name"``.
         env: Options of the environment, those that a policy file keeps.
         protocols: Names of protocols that vary the demonstrations, in turns; a name that stands
             there twice has twice as many.
@@ -94,7 +103,8 @@ class Lesson(Frozen):
             episode has one between 0 and that.
         share: Share of the control steps in which the network acts in those rounds, on average.
         stretch: Control steps that it acts at a stretch, on average.
-        keep: Fractional success of an episode, in the end, that is learned from.
+        keep: Fractional success of an episode, in the end, that is learned from; success where the
+            task has no other. A task without either needs 0: all episodes are learned from.
         settled: Control steps in a row that are as good as ``keep``, after which an episode of the
             teacher ends; None for the whole length of each. Recordings are taken as they are.
         symmetric: Whether each control step is also shown as the task's symmetries have it: the
@@ -103,7 +113,8 @@ class Lesson(Frozen):
             it gets back in the next control step; see ``scm_world.policies.PolicyAbout``. Not from
             recordings. In rounds it is given what the teacher remembers.
         observations: ``"plain"``, or ``"privileged"``: the network observes every causal parameter.
-        network: What learns.
+        network: What learns. With ``recurrent`` an LSTM learns sequences: its state goes on from
+            update to update, through which the loss is propagated back 32 control steps.
         updates: Steps of the optimizer, each time.
         batch: Control steps in each of them.
         rate: Learning rate at the beginning; it falls as a cosine.
@@ -139,8 +150,9 @@ class Lesson(Frozen):
     @field_validator("teacher")
     @classmethod
     def _named(cls, teacher: str) -> str:
-        if teacher not in NAMED:
-            raise UnknownOption("teacher", teacher, (*NAMED, "a recording"))
+        if teacher not in NAMED and not is_policy(teacher):
+            allowed = (*NAMED, "a policy file", "the folder of a training", "'zoo:name'")
+            raise UnknownOption("teacher", teacher, (*allowed, "a recording"))
         return teacher
 
     @field_validator("env")
@@ -148,7 +160,8 @@ class Lesson(Frozen):
     def _of_a_policy(cls, env: dict[str, Any]) -> dict[str, Any]:
         for name, value in env.items():
             one_of("option of the environment of a lesson", name, OPTIONS)
-            if value not in (allowed := ONLY.get(name, (value,))):
+            kind = context_of(value)[0] if name == "context" else value
+            if kind not in (allowed := ONLY.get(name, (kind,))):
                 raise UnknownOption(
                     f"{name} of a lesson", value, [json.dumps(one) for one in allowed]
                 )
@@ -158,7 +171,10 @@ class Lesson(Frozen):
     def _remembers(self) -> Self:
         if self.memory and self.symmetric:
             raise UnknownOption("symmetric", True, ("False", "True with memory=False"))
-        if self.memory and not hasattr(NAMED[self.teacher](), "memory"):
+        if self.network.recurrent is not None and (self.memory or self.symmetric):
+            known = ("None", "a width with memory=False and symmetric=False")
+            raise UnknownOption("network.recurrent", self.network.recurrent, known)
+        if self.memory and not hasattr(NAMED.get(self.teacher, object)(), "memory"):
             allowed = (f"False: {self.teacher!r} does not report its memory",)
             raise UnknownOption("memory of a lesson", True, allowed)
         return self
@@ -179,6 +195,24 @@ class Lesson(Frozen):
     def about(self) -> dict[str, Any]:
         """Return it as plain data."""
         return {"format": "scm_world/lesson/1", **self.model_dump(mode="json")}
+
+
+def is_policy(text: str) -> bool:
+    """Return whether a text is the name of a trained policy in the zoo, its file or its run."""
+    path = Path(text)
+    is_run = any((path / name).is_file() for name in ("best.safetensors", "policy.safetensors"))
+    return text.startswith(ZOO) or path.suffix == ".safetensors" or is_run
+
+
+def teacher_in(lesson: Lesson, world: World) -> Callable[[], Policy]:
+    """Return what makes the teacher of an episode in a world.
+
+    A trained one observes, in its own form, a second world that is restored to every instant.
+    """
+    if lesson.teacher in NAMED:
+        return NAMED[lesson.teacher]
+    trained = in_world(lesson.teacher, world)
+    return lambda: trained
 
 
 def lesson(task: str, **changes: object) -> Lesson:
@@ -226,7 +260,9 @@ Demonstrations = dict[str, NDArray[Any]]
 - ``before``: What the teacher remembered before each control step, -1 or 1, or 0 in the first one
   of an episode, shape (n, m); m is 0 without a memory.
 - ``after``: Its memory afterwards, of the same shape.
-- ``scores``: Fractional success at the end of each episode, shape (episodes,).
+- ``lengths``: Rows of each episode that was kept.
+- ``scores``: Fractional success at the end of each episode, shape (episodes,); its return where
+  there is no success, and NaN where states grew beyond all bounds.
 - ``kept``: Whether its control steps are there, shape (episodes,).
 """
 
@@ -238,12 +274,24 @@ def successful(
 ) -> Demonstrations:
     """Return demonstrations; ``rows`` are the control steps of all episodes, in order of ``ROWS``.
 
-    Episodes are left out whose score is less than ``keep``.
+    Episodes are left out whose score is less than ``keep`` (none with 0), or not a number.
     """
     ends = np.array(scores)
-    taken = np.repeat(ends >= keep, lengths)
+    kept = (ends >= keep) | ((keep == 0.0) & np.isfinite(ends))
+    taken = np.repeat(kept, lengths)
     found = {n: np.array(one, np.float32)[taken] for n, one in zip(ROWS, rows, strict=True)}
-    return {**found, "scores": ends, "kept": ends >= keep}
+    return {**found, "lengths": np.array(lengths)[kept], "scores": ends, "kept": kept}
+
+
+def metric_of(names: Container[str], lesson: Lesson) -> str | None:
+    """Return the info that says how good an episode is; None if there is none, and all are kept."""
+    found = next((name for name in (FRACTION, SUCCESS) if name in names), None)
+    if found is None and (lesson.keep or lesson.settled is not None):
+        what = "keep of a lesson" if lesson.keep else "settled of a lesson"
+        allowed = "0: all episodes are learned from" if lesson.keep else "None"
+        reason = f"{allowed}, as {lesson.task} says neither {FRACTION!r} nor {SUCCESS!r}"
+        raise UnknownOption(what, lesson.keep or lesson.settled, (reason,))
+    return found
 
 
 def joined(parts: Sequence[Demonstrations]) -> Demonstrations:
@@ -253,7 +301,7 @@ def joined(parts: Sequence[Demonstrations]) -> Demonstrations:
         scores = found["scores"]
         problem = (
             f"none of {len(scores)} demonstrations ended well enough to learn from; the best one "
-            f"reached {scores.max(initial=0.0):.3f}: take another teacher, less noise, or a "
+            f"reached {np.nanmax(scores, initial=0.0):.3f}: take another teacher, less noise, or a "
             "smaller keep"
         )
         raise ModelError([problem])
@@ -270,28 +318,26 @@ def demonstrated(
 ) -> Demonstrations:
     """Record episodes of the teacher, and now and then of a learner; those that fail are left out.
 
+    So are those in which states grow beyond all bounds.
+
     The job has the numbers of the episodes and the backend. An episode follows from the seed, the
     round and its number.
     """
     numbers, backend = job
-    with closing(ScmWorldEnv(lesson.task, backend=backend, **lesson.options)) as env:
-        metrics = [name for name in (FRACTION, SUCCESS) if name in env.world.model]
-        if not metrics:
-            allowed = (
-                f"a task with {FRACTION!r} or {SUCCESS!r}: only what ended well is learned from"
-            )
-            raise UnknownOption("task of a lesson", lesson.task, (allowed,))
+    options = {"on_failure": "truncate", **lesson.options}
+    with closing(ScmWorldEnv(lesson.task, backend=backend, **options)) as env:
+        metric, teacher = metric_of(env.world.model, lesson), teacher_in(lesson, env.world)
         known = protocols_of(lesson.task)
         taught = [one for name in lesson.protocols for one in chosen([name], known)]
         shown, lengths, scores = list[tuple[Any, ...]](), list[int](), list[float]()
         for number in numbers:
             acting = under(env, taught[number % len(taught)])
             random = np.random.default_rng([seed, round_, number])
-            teaching = Teaching(lesson, random, learner, metrics[0])
+            teaching = Teaching(lesson, teacher(), random, learner, metric)
             info = play(acting, teaching, hooks=[teaching], seed=SEED + seed, episode=number)
             shown += teaching.pairs
             lengths.append(len(teaching.pairs))
-            scores.append(float(info[metrics[0]]))
+            scores.append(float("nan") if info[FAILED] else teaching.score)
     return successful(zip(*shown, strict=True), lengths, scores, lesson.keep)
 
 
@@ -300,25 +346,26 @@ class Teaching(Hook):
     """Acts in an episode as the teacher does, or now and then as the learner does.
 
     ``pairs`` have a row for each control step, in order of ``ROWS``; ``metric`` is the info that
-    says how good the present is.
+    says how good the present is, and ``score`` the last one, or the return without it.
     """
 
     def __init__(
         self,
         lesson: Lesson,
+        teacher: Policy,
         random: np.random.Generator,
         learner: MlpPolicy | None,
-        metric: str,
+        metric: str | None,
     ) -> None:
         self._lesson, self._random, self._learner = lesson, random, learner
-        self._metric, self._learns, self._row = metric, False, 0
-        self._memory = np.empty(0)
+        self._metric, self._learns, self._row, self.score = metric, False, 0, 0.0
+        self._memory, self._teacher = np.empty(0), cast("Any", teacher)
+        self._state: NDArray[Any] | None = None
         self.pairs: list[tuple[Any, ...]] = []
 
     def start(self, env: ScmWorldEnv) -> None:
         """Begin an episode."""
         self._env = env
-        self._teacher: Any = NAMED[self._lesson.teacher]()
         self._scale = self._lesson.noise * self._random.uniform()
         self._share = self._lesson.share * self._random.uniform(0.0, 2.0)
         self._noises = action_noise(self._random, env.world.compiled.n_actions)
@@ -343,14 +390,20 @@ class Teaching(Hook):
         if self._learner is not None:
             if self._random.uniform() < 1.0 / lesson.stretch:
                 self._learns = self._random.uniform() < self._share
-            if self._learns:
-                memory = before if lesson.memory else None
-                action, _ = self._learner.predict(observation, memory)
+            if self._learns or lesson.network.recurrent:
+                state = before if lesson.memory else self._state
+                said, after = self._learner.predict(observation, state)
+                self._state = after if lesson.network.recurrent else None
+                action = said if self._learns else right
         return np.clip(action + self._scale * next(self._noises), -1.0, 1.0)
 
     def after(self, observation: object, reward: float, info: Mapping[str, Any]) -> bool:
         """End the episode where it has been good for long enough."""
-        self._row = self._row + 1 if float(info[self._metric]) >= self._lesson.keep else 0
+        if self._metric is None:
+            self.score += reward
+            return False
+        self.score = float(info[self._metric])
+        self._row = self._row + 1 if self.score >= self._lesson.keep else 0
         return self._row == self._lesson.settled
 
 
@@ -384,11 +437,11 @@ def given_demonstrations(
         allowed = ("plain: these recordings do not have the causal parameters",)
         raise UnknownOption("observations", lesson.observations, allowed)
     episodes = tuple(episode for one in recordings for episode in one)
-    metrics = [name for name in (FRACTION, SUCCESS) if all(name in e.infos for e in episodes)]
-    if not metrics:
-        problem = f"the recording does not say how episodes ended: record {FRACTION!r}, too"
-        raise ModelError([problem])
-    scores = [float(episode.infos[metrics[0]][-1]) for episode in episodes]
+    said = [name for name in (FRACTION, SUCCESS) if all(name in e.infos for e in episodes)]
+    if not said and lesson.keep:
+        problem = f"the recording does not say how episodes ended: record {FRACTION!r}, too, or "
+        raise ModelError([problem + "learn from all of them with keep=0"])
+    scores = [float(one.infos[said[0]][-1] if said else one.rewards.sum()) for one in episodes]
     seen, done = Recording(recordings[0].environment, episodes).pairs()
     rows = seen, done, *2 * [np.empty((len(seen), 0))]
     found = successful(rows, [len(episode) for episode in episodes], scores, lesson.keep)
@@ -403,7 +456,8 @@ def fitted(
 ) -> tuple[dict[str, NDArray[np.float32]], float]:
     """Fit a network to demonstrations, by Adam on Huber's loss.
 
-    With a memory the network also learns the memory of the teacher afterwards, from that before.
+    With a memory the network also learns the memory of the teacher afterwards, from that before. A
+    recurrent one learns sequences, by truncated backpropagation through time.
 
     Observations are whitened: turned into their principal components, each with a standard
     deviation of one. So how far a fingertip is from a block counts as much as where both are. The
@@ -427,18 +481,33 @@ def fitted(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         layers: list[Any] = []
-        width = seen.shape[1]
+        width, lstm = seen.shape[1], None
+        state: Any = None
+        if lesson.network.recurrent:
+            lstm = torch.nn.LSTMCell(width, width := lesson.network.recurrent)
+            layers.append(lstm)
+            sequences = in_sequences(shown["lengths"], max(1, lesson.batch // SEQUENCE), seed)
         for hidden in lesson.network.hidden:
             layers += [torch.nn.Linear(width, hidden), unit()]
             width = hidden
         network = torch.nn.Sequential(*layers, torch.nn.Linear(width, n_actions + after.shape[1]))
+        body = network if lstm is None else network[1:]
         optimizer = torch.optim.Adam(network.parameters(), lr=lesson.rate)
         falling = torch.optim.lr_scheduler.CosineAnnealingLR(
             optimizer, lesson.updates, eta_min=0.01 * lesson.rate
         )
         for _ in range(lesson.updates):
-            rows = torch.randint(0, len(seen), (lesson.batch,))
-            found = network(seen[rows])
+            if lstm is None:
+                rows = torch.randint(0, len(seen), (lesson.batch,))
+                found = body(seen[rows])
+            else:
+                taken, begins = next(sequences)
+                hidden_now = []
+                for now, goes_on in zip(seen[taken], torch.from_numpy(~begins), strict=True):
+                    state = lstm(now, state and [part * goes_on[:, None] for part in state])
+                    hidden_now.append(state[0])
+                rows, found = torch.from_numpy(taken.ravel()), body(torch.cat(hidden_now))
+                state = [part.detach() for part in state]
             loss = huber(found[:, :n_actions], done[rows])
             if after.shape[1]:
                 said = huber(found[:, n_actions:], after[rows], reduction="none")
@@ -453,14 +522,36 @@ def fitted(
         raise ModelError(["the loss is not finite any more: take a smaller rate"])
     arrays = [tensor.detach().numpy().astype(np.float64) for tensor in network.parameters()]
     first = arrays[0][:, :white]
-    arrays[:2] = [
-        np.concatenate([first @ turn, arrays[0][:, white:]], axis=1),
-        first @ shift + arrays[1],
-    ]
+    bias = 1 if lstm is None else 2  # of an LSTM both weights come first
+    arrays[0] = np.concatenate([first @ turn, arrays[0][:, white:]], axis=1)
+    arrays[bias] = first @ shift + arrays[bias]
     for array in arrays[-2:]:
         array[:n_actions] *= UNIT
-    names = [f"layers.{i // 2}.{('weight', 'bias')[i % 2]}" for i in range(len(arrays))]
+    kinds = ("weight", "bias")
+    names = [f"lstm.{i}.{kind}" for kind in kinds for i in range(2)] if lstm is not None else []
+    names += [f"layers.{i // 2}.{kinds[i % 2]}" for i in range(len(arrays) - len(names))]
     return {n: array.astype(np.float32) for n, array in zip(names, arrays, strict=True)}, last
+
+
+def in_sequences(
+    lengths: NDArray[Any], streams: int, seed: int
+) -> Iterator[tuple[NDArray[np.int64], NDArray[np.bool_]]]:
+    """Yield rows of episodes that follow one another in ``streams``, and which begin an episode.
+
+    Both have shape (``SEQUENCE``, streams). Episodes, of these ``lengths``, are drawn uniformly.
+    """
+    random, ends = np.random.default_rng(seed), np.cumsum(lengths)
+    at = stop = np.zeros(streams, np.int64)
+    while True:
+        rows = np.empty((SEQUENCE, streams), np.int64)
+        begins = np.empty((SEQUENCE, streams), bool)
+        for row, over in zip(rows, begins, strict=True):
+            over[:] = at == stop
+            drawn = random.integers(len(ends), size=streams)
+            at = np.where(over, (ends - lengths)[drawn], at)
+            stop = np.where(over, ends[drawn], stop)
+            row[:], at = at, at + 1
+        yield rows, begins
 
 
 def whitening(observations: NDArray[Any]) -> tuple[Floats, Floats]:
@@ -546,7 +637,7 @@ def clone(
     for name in backends if source is None else ():
         with closing(ScmWorldEnv(lesson.task, backend=name, **lesson.options)) as env:
             env.reset(seed=number)
-            NAMED[lesson.teacher]()(env.world)  # raises where it cannot act
+            teacher_in(lesson, env.world)()(env.world)  # raises where it cannot act
             made_with |= versions(env.world.engine)
     settings = {
         **lesson.about(),
@@ -555,6 +646,8 @@ def clone(
         "backend": backend,
         "recording": digest,
     }
+    if source is None and lesson.teacher not in NAMED:
+        settings["teacher"] = as_agent(lesson.teacher).about["sha256"]
     policies: list[MlpPolicy] = []
     with (
         torch_threads(1),
@@ -603,7 +696,7 @@ def clone(
                         "round": round_,
                         "control_steps": n,
                         "episodes": episodes,
-                        "teacher": float(pairs["scores"].mean()),
+                        "teacher": float(np.nanmean(pairs["scores"])),
                         "loss": loss,
                         "versions": made_with,
                     },

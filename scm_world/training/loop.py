@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any, cast, final
 
 from scm_world._arguments import load, whole_number
 from scm_world._fingerprint import fingerprint
@@ -20,6 +20,7 @@ from scm_world.queries.progress import Progress, Tell
 from scm_world.runs.files import read_bytes
 from scm_world.runs.study import Study
 from scm_world.tasks import make_task
+from scm_world.training.logs import check_callback, log_names, opened_log
 from scm_world.training.recipe import Recipe
 from scm_world.training.worlds import device_for
 
@@ -64,6 +65,8 @@ def train(
     tell: Tell | None = None,
     device: str = "auto",
     threads: int | None = None,
+    callback: object = None,
+    log: str | Sequence[str] | None = None,
 ) -> Trained:
     """Train an agent.
 
@@ -80,15 +83,22 @@ def train(
         start: Policy to begin with: a file, the folder of a run, or one of the zoo.
         progress: Called with how many steps are done, and how many there are.
         tell: Called with a sentence about each event.
-        device: ``"cpu"``, ``"cuda"``, or ``"auto"``: the GPU if there is one, but for ``"ppo"``.
+        device: ``"cpu"``, ``"cuda"``, or ``"auto"``: the GPU if there is one, but for PPO of
+            Stable-Baselines3 and sb3-contrib.
         threads: Threads of the backend and of torch. None: as many as there are cores for the
             backend, whose results do not depend on it, and one for torch, whose last bits do.
+        callback: A function that is called with the numbers of each round, by the names of
+            ``progress.csv``; or a ``BaseCallback`` of Stable-Baselines3, for its algorithms.
+        log: Where these numbers go besides ``progress.csv``: ``"tensorboard"``, ``"wandb"``,
+            ``"trackio"``; one, several, or a text with commas. A run that resumes goes on there.
+            None: tensorboard, but for ``"rsl_ppo"``, which has none.
 
     Returns:
         Where its policies are.
 
     Raises:
-        MissingExtra: Stable-Baselines3, or rsl-rl for ``"rsl_ppo"``, is not installed.
+        MissingExtra: Stable-Baselines3, or the library of the algorithm or of ``log``, is not
+            installed.
         UnknownOption: Something is asked for that does not exist.
         UnreadableFile: Another training is in the folder, or another process is writing to it.
         UnwritableFolder: The disk is full, or permission is missing.
@@ -101,8 +111,13 @@ def train(
         from scm_world.training import many as library
     else:
         load(*used)
+        if recipe.algo == "recurrent_ppo":
+            load(*(used := ("sb3_contrib", "sb3-contrib", "train")))
         from scm_world.training import algorithms as library
 
+    check_callback(callback, recipe.algo)
+    logs = log_names(log, recipe.algo)
+    own, function = (callback, None) if hasattr(callback, "on_rollout_start") else (None, callback)
     if whole_number("seed", seed, least=0) > LARGEST_SEED:
         raise UnknownOption("seed", seed, (f"any whole number from 0 to {LARGEST_SEED}",))
     count = None if threads is None else whole_number("threads", threads, least=1)
@@ -132,10 +147,21 @@ def train(
                 **{name: version(name) for name in ("torch", used[1])},
             },
         }
-        with Study(folder, "training", settings) as study:
+        with (
+            Study(folder, "training", settings) as study,
+            opened_log(logs, folder, card, cast("Any", function)) as told,
+        ):
             say(f"Training {recipe}; on {backend}, seed {seed}, in {folder}")
-            about = {"backend": backend, "card": card, "progress": progress, "tell": say}
-            score = library.learn(model, recipe, study, **about, begun=first is not None)
+            about: dict[str, Any] = {
+                "backend": backend,
+                "card": card,
+                "progress": progress,
+                "tell": say,
+            }
+            about |= {"begun": first is not None, "log": told}
+            if recipe.algo != "rsl_ppo":
+                about |= {"callback": own, "tensorboard": "tensorboard" in logs}
+            score = library.learn(model, recipe, study, **about)
     policy, best = folder / "policy.safetensors", folder / "best.safetensors"
     done = int(load_policy(policy).about.card["steps"])  # type: ignore[arg-type] # JSON
     best = best if best.exists() else policy

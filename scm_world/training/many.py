@@ -23,10 +23,11 @@ from scm_world.queries.progress import Progress, Tell
 from scm_world.runs.files import make_folder, write_whole
 from scm_world.runs.study import Study
 from scm_world.training.export import begin_tensors
+from scm_world.training.logs import Log
 from scm_world.training.recipe import Recipe
 from scm_world.training.rounds import Rounds, restore_last
 from scm_world.training.settings import Ppo
-from scm_world.training.worlds import SEEDS, SUCCESS, make_envs, scales
+from scm_world.training.worlds import SEEDS, SUCCESS, actor_columns, make_envs, scales
 
 try:
     import torch
@@ -39,6 +40,9 @@ except ImportError as error:
 
 SEEN = "seen"
 """The group of observations."""
+
+ALL = "all"
+"""The group of observations of a critic that observes more."""
 
 BOUND = 10.0
 """Largest size of a scaled reward."""
@@ -75,7 +79,7 @@ class ManyPpo:
         self, recipe: Recipe, *, backend: str, seed: int, device: str, threads: int | None
     ) -> None:
         self.recipe, self.device, self.num_timesteps = recipe, device, 0
-        self._envs: Any = make_envs(recipe, backend=backend, threads=threads)
+        self._envs: Any = make_envs(recipe, backend=backend, threads=threads, seed=seed)
         try:
             self._build(seed)
         except BaseException:
@@ -93,14 +97,18 @@ class ManyPpo:
         (self.world, *_) = envs.get_attr("world")
         (self._length, *_) = envs.get_attr("limit")
         (layout, *_) = envs.get_attr("layout")
-        scale = scales(layout, space, recipe.options) if recipe.network.scaled else np.ones(1)
-        self.scale = np.asarray(scale, np.float32)
-        self._scale = torch.as_tensor(self.scale, device=self.device)
+        (appended, *_) = envs.get_attr("appended")
+        scale = np.ones(space.shape)
+        if recipe.network.scaled:
+            scale = scales(layout, space, recipe.options)
+        self._columns = actor_columns(recipe, layout, appended)
+        self.scale = np.asarray(scale, np.float32)[self._columns]
+        self._scale = torch.as_tensor(scale, dtype=torch.float32, device=self.device)
         self._seed = (seed + 1) * SEEDS
         torch.manual_seed(seed)
         n, n_actions = recipe.worlds, envs.single_action_space.shape[0]
         first = self._seen(np.zeros((n, *space.shape), np.float32))
-        groups = {name: [SEEN] for name in ("actor", "critic")}
+        groups = {"actor": [SEEN], "critic": [ALL if recipe.observations == "critic" else SEEN]}
         network = recipe.network
         shape: dict[str, Any] = {"hidden_dims": [*network.hidden], "activation": network.activation}
         normal = {
@@ -149,7 +157,10 @@ class ManyPpo:
 
     def _seen(self, observation: Any) -> TensorDict:
         rows = torch.as_tensor(observation, device=self.device) * self._scale
-        return TensorDict({SEEN: rows}, batch_size=[len(rows)], device=self.device)
+        seen = {SEEN: rows}
+        if self.recipe.observations == "critic":
+            seen = {SEEN: rows[:, self._columns], ALL: rows}
+        return TensorDict(seen, batch_size=[len(rows)], device=self.device)
 
     def _begin(self) -> TensorDict:
         """Begin all episodes; staggered, world i of n begins i / n of an episode later."""
@@ -264,6 +275,8 @@ class ManyPpo:
     def policy(self, card: Mapping[str, Any]) -> MlpPolicy:
         """Return the policy, without torch."""
         tensors = {name: one.detach().cpu().numpy().copy() for name, one in self.tensors().items()}
+        if self.recipe.observations == "critic":  # the value observes more
+            tensors = {name: one for name, one in tensors.items() if not name.startswith("value")}
         for name in tensors:
             if name.endswith("layers.0.weight"):
                 tensors[name] *= self.scale
@@ -303,8 +316,9 @@ def opened(
 
 def begin_with(model: ManyPpo, recipe: Recipe, start: Path | str) -> None:
     """Initialise policy and value with the weights of a policy file."""
-    tensors = model.tensors()
-    begin_tensors(load_policy(start), model.policy({}), start, tensors, model.scale)
+    mine = model.policy({})
+    tensors = {name: one for name, one in model.tensors().items() if name in mine.tensors()}
+    begin_tensors(load_policy(start), mine, start, tensors, model.scale)
 
 
 def learn(
@@ -317,6 +331,7 @@ def learn(
     progress: Progress | None,
     tell: Tell,
     begun: bool,  # whether the weights are those of a policy
+    log: Log,
 ) -> float | None:
     """Learn the remaining steps; write the curve, checkpoints, evaluations and the policy.
 
@@ -341,6 +356,7 @@ def learn(
     first = model.num_timesteps
     curve, rows = folder / (f"progress-{first}.csv" if first else "progress.csv"), []
     how: dict[str, Any] = {"backend": backend, "progress": progress, "tell": tell}
+    how["seed"] = card["seed"]
     rounds = Rounds(recipe, study, **how, save=save, policy=policy)
     rounds.begin(first)
     try:
@@ -352,7 +368,9 @@ def learn(
             rows.append({**recent, **{f"train/{n}": v for n, v in losses.items()}})
             rows[-1] |= {"time/total_timesteps": steps, "time/cpu_seconds": time.process_time()}
             means = {name.partition("/")[2]: value for name, value in recent.items()}
-            rounds.look(steps, (f"{name} {value:.3g}" for name, value in means.items()))
+            scores = rounds.look(steps, (f"{name} {value:.3g}" for name, value in means.items()))
+            rows[-1] |= {f"evaluation/{name}": value for name, value in scores.items()}
+            log(rows[-1], steps)
     finally:  # also after Ctrl-C
         if rows:
             _write(curve, rows)

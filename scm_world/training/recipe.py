@@ -63,10 +63,15 @@ class Recipe(Frozen):
     Attributes:
         task: Name of the task; a file, or ``"module:function"``, for one of a model.
         algo: ``"ppo"``, ``"sac"`` or ``"td3"`` of Stable-Baselines3; ``"rsl_ppo"``: PPO of rsl-rl,
-            for thousands of worlds, whose networks, storage and updates stay on a GPU.
+            for thousands of worlds, whose networks, storage and updates stay on a GPU;
+            ``"recurrent_ppo"`` of sb3-contrib: PPO with an LSTM, of width ``network.recurrent``.
         name: ``"tuned"`` where it comes from ``recipe``.
         env: Options of the environment.
         curriculum: Interventions in it; plain data of a ``Curriculum``.
+        levels: Train on so many draws of the curriculum and the noise: each episode is one of them,
+            drawn uniformly. Level i is episode i of the noise ``training.worlds.level_seed``.
+            Trials then have scores on these levels (the first ``trials.episodes``) and on new
+            draws, and the gap between both. None: new draws for ever.
         worlds: How many are simulated together.
         steps: Control steps of training, in all worlds together.
         settings: Settings of the algorithm.
@@ -78,15 +83,18 @@ class Recipe(Frozen):
         staggered: Begin the worlds at different steps of their episodes.
         critic_warmup: Control steps in which PPO learns the value only.
         hindsight: Hindsight experience replay, with sparse rewards, if given (SAC and TD3).
-        observations: ``"plain"``, or ``"privileged"``: with every causal parameter.
+        observations: ``"plain"``; ``"privileged"``: with every causal parameter, or those that
+            ``env["context"]`` names; ``"critic"`` (PPO): with these for the value alone, which
+            policy files do not have.
         trials: Evaluations while it is trained.
     """
 
     task: TaskName
-    algo: Literal["ppo", "sac", "td3", "rsl_ppo"] = "ppo"
+    algo: Literal["ppo", "sac", "td3", "rsl_ppo", "recurrent_ppo"] = "ppo"
     name: str = "own"
     env: dict[str, Any] = Field(default_factory=dict)
     curriculum: dict[str, Any] = Field(default_factory=PUBLISHED["0"].as_dict)
+    levels: Count | None = None
     worlds: Count = 64
     steps: Count = 1_000_000
     settings: SerializeAsAny[Ppo | OffPolicy] = Field(default_factory=Ppo)
@@ -97,7 +105,7 @@ class Recipe(Frozen):
     staggered: bool = True
     critic_warmup: Annotated[int, Field(ge=0)] = 0
     hindsight: Hindsight | None = None
-    observations: Observations = "plain"
+    observations: Observations | Literal["critic"] = "plain"
     trials: Trials = Field(default_factory=Trials)
 
     @field_validator("env")
@@ -144,6 +152,18 @@ class Recipe(Frozen):
     @model_validator(mode="after")
     def _fits(self) -> Self:
         """Refuse fields that do not go together."""
+        width = self.network.recurrent
+        if (width is None) == (self.algo == "recurrent_ppo"):
+            allowed = "a width, such as 128" if width is None else "None, or algo='recurrent_ppo'"
+            raise UnknownOption(f"network.recurrent with {self.algo}", width, (allowed,))
+        if self.observations == "critic":
+            if self.algo not in ("ppo", "rsl_ppo"):
+                known = ("'plain'", "'privileged'", "algo='ppo' or 'rsl_ppo'")
+                raise UnknownOption(f"observations with {self.algo}", "critic", known)
+            for name in ("goal_env", "stack_history"):
+                if self.env.get(name):
+                    said = "False: the observation is one vector"
+                    raise UnknownOption(f"{name} with observations='critic'", True, (said,))
         if isinstance(self.settings, Ppo):
             if self.algo == "rsl_ppo":
                 self._fits_rsl(self.settings)
@@ -162,6 +182,10 @@ class Recipe(Frozen):
                 raise UnknownOption(f"{name} with {self.algo}", True, ("none: it is of PPO",))
             if self.hindsight is not None and self.settings.n_steps > 1:
                 raise UnknownOption("n_steps with hindsight", self.settings.n_steps, ("1",))
+        parts = as_curriculum(self.curriculum).parts() if self.levels else ()
+        if any(part.kind == "stages" for part in parts):
+            none = "None: stages follow from the episodes before"
+            raise UnknownOption("levels of a curriculum with stages", self.levels, (none,))
         if self.steps < self.round:
             least = f"at least {self.round:,}: {self.worlds} worlds make so many in one round"
             raise UnknownOption("steps", self.steps, (least,))
@@ -212,6 +236,8 @@ class Recipe(Frozen):
     def options(self) -> dict[str, Any]:
         """Options of the environment, with all that follows from the other fields."""
         found = observed(self.env, self.observations)
+        if self.observations == "critic":
+            found["context"] = "none"
         if self.hindsight is not None:
             given = found.get("task_options") or {}
             kept = {name: value for name, value in given.items() if name not in REWARDS}
@@ -221,9 +247,11 @@ class Recipe(Frozen):
     @property
     def trained_in(self) -> dict[str, Any]:
         """Options of the environment while the agent is trained."""
-        if self.episode_length is None:
-            return self.options
-        return {**self.options, "max_episode_length": self.episode_length}
+        found = {**self.options}
+        if self.observations == "critic":
+            found |= {"context": observed(self.env, "critic")["context"]}
+        length = self.episode_length
+        return found if length is None else {**found, "max_episode_length": length}
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as plain data."""
@@ -276,7 +304,7 @@ def recipe(
             ``"module:function"`` for a function or class that gives a task. What its class has in
             ``training`` takes precedence over the usual values. Trials of a task of another
             package are in P0, A and B, as far as there are these.
-        algo: ``"ppo"``, ``"sac"``, ``"td3"`` or ``"rsl_ppo"``.
+        algo: ``"ppo"``, ``"sac"``, ``"td3"``, ``"rsl_ppo"`` or ``"recurrent_ppo"``.
         curriculum: The name of a protocol of the task, such as ``"P10"``: its variables vary
             in each episode. 0, 1 or 2 for the published ones: nothing, goals, everything; the path
             of a JSON file; or a ``Curriculum``, interventions, or plain data. The usual one of the

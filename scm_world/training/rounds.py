@@ -31,6 +31,7 @@ class Rounds:
         recipe: How it is trained.
         study: Where its files are.
         backend: Its engine.
+        seed: Its seed.
         progress: Called with how many steps are done, and how many there are.
         tell: Called with a sentence about each event.
         save: Writes a checkpoint and the policy.
@@ -46,6 +47,7 @@ class Rounds:
         study: Study,
         *,
         backend: str,
+        seed: int,
         progress: Progress | None,
         tell: Tell,
         save: Callable[[], None],
@@ -53,7 +55,7 @@ class Rounds:
     ) -> None:
         self._recipe, self._progress, self._tell = recipe, progress, tell
         self._save, self._policy = save, policy
-        self.scores = Evaluations(recipe, backend, Path(str(study.folder)))
+        self.scores = Evaluations(recipe, backend, Path(str(study.folder)), seed)
         self.begin(0)
 
     def begin(self, steps: int) -> None:

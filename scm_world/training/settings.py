@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar, final
 from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
 
 from scm_world._arguments import load, one_of, plain
+from scm_world.env.observer import EVERY, context_of
 from scm_world.errors import ScmWorldError, UnknownOption
 from scm_world.evaluation.episodes import METRICS
 from scm_world.tasks import TASKS, Task, tasks
@@ -32,7 +33,7 @@ Share = Annotated[float, Field(ge=0.0, le=1.0)]
 NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Observations = Literal["plain", "privileged"]
-"""What a policy observes: its task, or also every causal parameter."""
+"""What a policy observes: its task, or also the causal parameters."""
 
 
 Made = TypeVar("Made", bound=Frozen)
@@ -102,9 +103,10 @@ ALGORITHMS: dict[str, type[Ppo | OffPolicy]] = {
     "sac": Sac,
     "td3": Td3,
     "rsl_ppo": Ppo,
+    "recurrent_ppo": Ppo,
 }
 """The settings of each algorithm: keyword arguments of Stable-Baselines3, by its names. The last
-one is PPO of rsl-rl, for thousands of worlds."""
+ones are PPO of rsl-rl, for thousands of worlds, and recurrent PPO of sb3-contrib."""
 
 
 @final
@@ -155,6 +157,7 @@ class Network(Frozen):
 
     Attributes:
         hidden: Widths of its hidden layers.
+        recurrent: Width of an LSTM before them, whose state lasts an episode. None: without one.
         activation: After each of them.
         log_std: Logarithm of the standard deviation with which PPO begins.
         log_std_end: Ceiling of it at the end of the training; it falls in a straight line from the
@@ -164,6 +167,7 @@ class Network(Frozen):
     """
 
     hidden: Annotated[tuple[Count, ...], Field(min_length=1)] = (256, 256)
+    recurrent: Count | None = None
     activation: Literal["tanh", "relu"] = "tanh"
     log_std: Finite = 0.0
     log_std_end: Finite | None = None
@@ -201,14 +205,19 @@ class Trials(Frozen):
     metric: Metric | None = None
 
 
-def observed(env: Mapping[str, Any], observations: Observations) -> dict[str, Any]:
-    """Return options of an environment with the observations that a policy gets.
+def observed(env: Mapping[str, Any], observations: str) -> dict[str, Any]:
+    """Return options of an environment with the observations that a policy or its critic gets.
+
+    All parameters are observed, or those of ``env["context"]``.
 
     Example:
         >>> observed({"frame_skip": 5}, "privileged")
         {'frame_skip': 5, 'context': 'observation'}
     """
-    return {**env, "context": "observation"} if observations == "privileged" else dict(env)
+    if observations == "plain":
+        return dict(env)
+    _, names = context_of(env.get("context", "none"))
+    return {**env, "context": "observation" if names == EVERY else {"observation": [*names]}}
 
 
 def built(
@@ -271,7 +280,8 @@ def _merged(before: object, value: object) -> Any:
 def presets() -> Mapping[str, Any]:
     """Return the settings that work, of ``presets.yaml``: algorithms, recipes, lessons."""
     yaml = load("yaml", "pyyaml")
-    found: Mapping[str, Any] = yaml.safe_load((Path(__file__).parent / "presets.yaml").read_text())
+    text = (Path(__file__).parent / "presets.yaml").read_text("utf-8")
+    found: Mapping[str, Any] = yaml.safe_load(text)
     return found
 
 

@@ -34,10 +34,16 @@ SCALES: Mapping[str, float] = {
 """Factor of a normalized number, by its quantity, so that it varies by about one."""
 
 
-def make_envs(recipe: Recipe, *, backend: str, threads: int | None = None) -> Any:
+def level_seed(seed: int) -> int:
+    """Return the seed of the noise of the levels of a training."""
+    return (seed + 1) * SEEDS
+
+
+def make_envs(recipe: Recipe, *, backend: str, threads: int | None = None, seed: int = 0) -> Any:
     """Make the environments of a recipe, in which the next episode begins in the same step.
 
     A backend that steps many worlds in one call has ``threads``, another one as many processes.
+    The seed is that of the training: it decides its levels, if there are some.
 
     Raises:
         UnknownOption: Actions are choices, which policies of files do not have.
@@ -49,6 +55,8 @@ def make_envs(recipe: Recipe, *, backend: str, threads: int | None = None) -> An
         recipe.worlds,
         as_curriculum(recipe.curriculum),
         autoreset_mode=AutoresetMode.SAME_STEP,
+        levels=recipe.levels,
+        level_seed=level_seed(seed),
         backend=backend,
         task=recipe.task,
         **{several: threads},
@@ -76,17 +84,36 @@ def scales(layout: Mapping[str, Any], space: Any, env: Mapping[str, Any]) -> Flo
         raise UnknownOption("normalize_observations with network.scaled", False, ("True",))
     found = []
     for key, part in getattr(space, "spaces", {"observation": space}).items():
-        scale = np.ones(part.shape[0])
+        scale = np.ones(int(np.prod(part.shape)))
         for name, where in layout.items() if key == "observation" else ():
-            scale[where] = SCALES.get(name.rpartition(".")[2], 1.0)
+            scale[where] = SCALES.get(name.partition("@")[0].rpartition(".")[2], 1.0)
         found.append(scale)
     return np.concatenate(found)
 
 
+def actor_columns(recipe: Recipe, layout: Mapping[str, Any], appended: Any) -> Any:
+    """Return the numbers of a vector that an actor observes: not what the critic alone does.
+
+    Args:
+        recipe: How it is trained.
+        layout: Where each variable is in the vector.
+        appended: The names of the parameters among them that were added for the critic.
+
+    Returns:
+        Shape (n,); ``slice(None)`` where it observes the same as the critic.
+    """
+    if recipe.observations != "critic":
+        return slice(None)
+    hidden = {*appended}
+    there = [at for name, at in layout.items() if name.partition("@")[0] not in hidden]
+    return np.concatenate([np.arange(at.start, at.stop) for at in there])
+
+
 def device_for(recipe: Recipe, device: str) -> str:
-    """Choose where networks are computed; those of ``"ppo"`` are too small to gain from a GPU."""
+    """Choose where networks are computed; those of PPO are too small to gain from a GPU."""
     one_of("device", device, ("auto", "cpu", "cuda"))
+    small = "ppo", "recurrent_ppo"
     has_gpu = device != "cpu" and load("torch", "torch", "train").cuda.is_available()
     if device == "cuda" and not has_gpu:
         raise UnknownOption("device", device, ("cpu: torch finds no GPU here",))
-    return "cuda" if has_gpu and (device == "cuda" or recipe.algo != "ppo") else "cpu"
+    return "cuda" if has_gpu and (device == "cuda" or recipe.algo not in small) else "cpu"

@@ -123,6 +123,9 @@ class Continuous(Sampler):
     def __init__(self, family: str, **parameters: object) -> None:
         super().__init__(family=family, parameters=parameters.pop("parameters", parameters))
 
+    def __hash__(self) -> int:
+        return hash((self.family, frozenset(self.parameters.items())))
+
     @cached_property
     def frozen(self) -> Any:
         """The distribution of scipy, with its parameters."""

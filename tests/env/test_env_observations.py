@@ -113,6 +113,54 @@ def test_privileged_context_is_told_apart() -> None:
     assert env.observation_space.contains(then)
 
 
+@pytest.mark.parametrize("history", [0, 2])
+def test_a_context_can_be_some_parameters(history: int) -> None:
+    """Names or patterns of them, appended or beside the vector, in the order of all of them."""
+    both: dict[str, Any] = {"history": history, "normalize_observations": False}
+    every, _ = make(context="privileged", **both).reset(seed=0)
+    model = make(context="observation").unwrapped
+    masses = [name for name in model.appended if name.endswith(".mass")]
+    wanted = [*masses, "floor_friction"]
+    wanted.sort(key=model.appended.index)
+    given = ["floor_friction", "*.mass"]
+    env, plain = make(context=given, **both), make(**both)
+    assert [*env.unwrapped.appended] == wanted
+    seen, _ = env.reset(seed=0)
+    bare, _ = plain.reset(seed=0)
+    assert seen[:56].tolist() == bare[:56].tolist()
+    values = [float(env.unwrapped.world[name]) for name in wanted]
+    np.testing.assert_allclose(seen[56 : 56 + len(wanted)], values, rtol=1e-6)
+    same, _ = make(context={"observation": given}, **both).reset(seed=0)
+    np.testing.assert_array_equal(seen, same)
+    beside, _ = make(context={"privileged": given}, **both).reset(seed=0)
+    np.testing.assert_array_equal(beside["observation"], bare)
+    np.testing.assert_array_equal(beside["context"], seen[56 : 56 + len(wanted)])
+    assert len(every["context"]) > len(beside["context"])
+    one, _ = make(context="floor_friction", **both).reset(seed=0)
+    assert len(one) == len(bare) + 1 + history
+
+
+@pytest.mark.parametrize(
+    "context",
+    [
+        "privileged ones",
+        "*.colour",
+        ["*.mass", "joint_positions"],
+        ["reward"],
+        [],
+        3,
+        [3],
+        {"privileged": []},
+        {"hidden": "*.mass"},
+        {"privileged": "*.mass", "observation": "floor_friction"},
+    ],
+)
+def test_a_context_of_no_parameters_is_refused(context: Any) -> None:
+    """What fits nothing, or is not a parameter that an intervention can set."""
+    with pytest.raises(UnknownOption, match="context"):
+        make(context=context)
+
+
 def test_a_view_is_the_same_however_axes_are_named() -> None:
     """Quarter turns with exchanged edges, and half turns of the goal, are one box and one view."""
     env = make(keypoints="view", normalize_observations=False)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +17,7 @@ import scm_world  # noqa: F401 # registers the environments
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import ActionError, MissingExtra, ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation.recording import record
-from scm_world.policies import MlpPolicy, load_policy
+from scm_world.policies import MlpPolicy, load_policy, save_policy
 from scm_world.tasks import make_task
 from scm_world.training import imitation
 from scm_world.training.imitation import (
@@ -46,6 +48,8 @@ QUICK: dict[str, Any] = {
     "trials": {"protocols": []},
 }
 
+CAUSES: dict[str, Any] = {"context": "observation"}
+
 WIDTH = 53
 """Numbers that a policy of the usual lesson of picking observes."""
 
@@ -63,6 +67,113 @@ def constant(action: float) -> MlpPolicy:
         "layers.0.bias": np.full(9, action, np.float32),
     }
     return MlpPolicy.of(tensors, {"task": "picking"})
+
+
+CART = f"{Path(__file__).parents[1] / 'env' / 'model_tasks.py'}:Falling"
+
+
+def test_sequences_are_whole_episodes() -> None:
+    """Each stream runs through one episode after another, and all episodes come."""
+    lengths = np.array([3, 5, 40])
+    owner = np.repeat(np.arange(3), lengths)
+    found = list(itertools.islice(imitation.in_sequences(lengths, 2, 0), 20))
+    rows, begins = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    for stream, first in zip(rows.T, begins.T, strict=True):
+        starts = np.flatnonzero(first)
+        assert starts[0] == 0
+        assert {*owner[stream]} == {0, 1, 2}
+        for one, after in itertools.pairwise(starts):
+            episode = stream[one:after]
+            np.testing.assert_array_equal(episode, np.flatnonzero(owner == owner[episode[0]]))
+
+
+def test_a_recurrent_network_learns_what_was_seen_before() -> None:
+    """An action that follows from what was seen in the first control step only."""
+    pytest.importorskip("torch")
+    random = np.random.default_rng(0)
+    seen = random.normal(size=(200, 10, 3)).astype(np.float32)
+    wanted = np.broadcast_to(np.where(seen[:, :1, :1] > 0.0, 0.5, -0.5), (200, 10, 1))
+    rows = [seen.reshape(2000, 3), wanted.reshape(2000, 1), *2 * [np.empty((2000, 0))]]
+    shown_ = successful(rows, [10] * 200, [1.0] * 200, 1.0)
+    network = {"hidden": [16], "recurrent": 16}
+    how = lesson("picking", updates=120, batch=512, symmetric=False, network=network, rate=1e-2)
+    tensors, _ = fitted(shown_, how, seed=0)
+    policy = MlpPolicy.of(tensors, {"task": "any", "activation": "relu"})
+    fresh, state = random.normal(size=(10, 100, 3)), None
+    for now in fresh:
+        action, state = policy.predict(now, state)
+    assert (np.sign(action[:, 0]) == np.sign(fresh[0, :, 0])).mean() > 0.8
+    assert np.abs(np.abs(action) - 0.5).mean() < 0.3
+
+
+def test_a_trained_teacher_observes_its_own_form(tmp_path: Path) -> None:
+    """Of the same world at the same instant: its actions follow from the causes by its weights."""
+    with closing(ScmWorldEnv(CART, **CAUSES)) as env:
+        width = env.observation_space.shape[0]  # type: ignore[index]
+    weight = np.random.default_rng(0).normal(0.0, 0.2, (1, width)).astype(np.float32)
+    tensors = {"layers.0.weight": weight, "layers.0.bias": np.zeros(1, np.float32)}
+    path = save_policy(tmp_path / "teacher.safetensors", tensors, {"task": CART, "env": CAUSES})
+    given: dict[str, Any] = {**QUICK, "teacher": str(path), "rounds": 0, "env": {}}
+    plain, wide = (
+        demonstrated((range(2), "mujoco"), lesson=lesson(CART, **given, **more), seed=0)
+        for more in ({}, {"observations": "privileged"})
+    )
+    wanted = MlpPolicy.of(tensors)(wide["observations"])
+    np.testing.assert_allclose(wide["actions"], wanted, atol=1e-5)
+    np.testing.assert_array_equal(plain["actions"], wide["actions"])
+    narrow = plain["observations"].shape[1]
+    assert narrow < width
+    np.testing.assert_array_equal(plain["observations"], wide["observations"][:, :narrow])
+
+
+def test_an_episode_whose_world_is_lost_is_no_example(tmp_path: Path) -> None:
+    """A slider that is pushed becomes unstable; the others of the lesson are learned from."""
+    task = f"{Path(__file__).parents[1] / 'env' / 'test_env_failures.py'}:Growing"
+    with closing(ScmWorldEnv(task)) as env:
+        width = env.observation_space.shape[0]  # type: ignore[index]
+    for push, lost in ((1.0, True), (0.0, False)):
+        tensors = {"layers.0.weight": np.zeros((1, width), np.float32)}
+        tensors["layers.0.bias"] = np.full(1, push, np.float32)
+        path = save_policy(tmp_path / f"{push}.safetensors", tensors, {"task": task})
+        fields = {**QUICK, "teacher": str(path), "env": {"max_episode_length": 100}, "noise": 0.0}
+        found = demonstrated((range(2), "mujoco"), lesson=lesson(task, **fields), seed=0)
+        assert np.isnan(found["scores"]).tolist() == [lost, lost]
+        assert found["kept"].tolist() == [not lost, not lost]
+        assert len(found["actions"]) == (0 if lost else 200)
+    with pytest.raises(ModelError, match=r"none of 2 .* reached 0\.000"):
+        joined([{**found, "actions": found["actions"][:0], "scores": np.full(2, np.nan)}])
+
+
+def test_a_recurrent_student_resumes_and_repeats(tmp_path: Path) -> None:
+    """Rounds of a trained teacher, without success: interrupted or not, the same bits."""
+    pytest.importorskip("torch")
+    weight = np.full((1, 8), 0.1, np.float32)
+    with closing(ScmWorldEnv(CART)) as env:
+        weight = weight[:, : env.observation_space.shape[0]]  # type: ignore[index]
+    tensors = {"layers.0.weight": weight, "layers.0.bias": np.zeros(1, np.float32)}
+    path = save_policy(tmp_path / "teacher.safetensors", tensors, {"task": CART})
+    network = {"hidden": [4], "recurrent": 4}
+    how = lesson(CART, **{**QUICK, "teacher": str(path), "network": network, "stretch": 1.0})
+    whole = clone(None, how, out=tmp_path / "whole")
+
+    def interrupt(done: int, _: int) -> None:
+        if done > 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        clone(None, how, out=tmp_path / "parts", progress=interrupt)
+    parts = clone(None, how, out=tmp_path / "parts")
+    assert parts.policy.read_bytes() == whole.policy.read_bytes()
+    assert load_policy(whole.policy).n_remembered == 8
+    save_policy(path, {**tensors, "layers.0.bias": np.ones(1, np.float32)}, {"task": CART})
+    with pytest.raises(UnreadableFile, match="differ: teacher"):
+        clone(None, how, out=tmp_path / "whole")
+    with pytest.raises(UnknownOption, match=r"keep of a lesson.*0: all episodes"):
+        demonstrated((range(1), "mujoco"), lesson=lesson(CART, keep=0.5), seed=0)
+    with pytest.raises(UnknownOption, match=r"settled of a lesson.*None"):
+        demonstrated((range(1), "mujoco"), lesson=lesson(CART, keep=0.0, settled=3), seed=0)
+    with pytest.raises(UnknownOption, match=r"network\.recurrent.*symmetric=False"):
+        lesson("picking", network=network, symmetric=True)
 
 
 @pytest.mark.parametrize(

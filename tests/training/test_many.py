@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
+from scm_world.env import ScmWorldEnv
 from scm_world.errors import UnknownOption, UnreadableFile
 from scm_world.evaluation import evaluate
 from scm_world.policies import load_policy
@@ -41,8 +42,11 @@ GIVEN: dict[str, Any] = {"backend": "fake", "threads": 1, "seed": 3}
 
 def test_a_training_writes_what_others_write(tmp_path: Path) -> None:
     """A policy that the command evaluates, curves, checkpoints; the same bits again."""
-    found = train(RECIPE, out=tmp_path / "one", **GIVEN)
+    heard: list[dict[str, float]] = []
+    found = train(RECIPE, out=tmp_path / "one", **GIVEN, callback=heard.append)
     assert found.steps == 256
+    assert [row["time/total_timesteps"] for row in heard] == [*range(32, 257, 32)]
+    assert {"rollout/ep_rew_mean", "evaluation/P0"} <= heard[-1].keys()
     assert {path.stem for path in tmp_path.glob("one/evaluations/*.json")} == {"128", "256"}
     assert found.score == max(
         json.loads(path.read_text())["mean"] for path in tmp_path.glob("one/evaluations/*.json")
@@ -110,6 +114,28 @@ def test_the_policy_file_has_the_actions_of_the_network() -> None:
     np.testing.assert_allclose(policy(seen), wanted, atol=1e-5)
     np.testing.assert_allclose(policy.values(seen), value, atol=1e-5)
     assert model.scale.max() > 1.0
+
+
+def test_a_critic_can_observe_more_than_the_actor() -> None:
+    """The causal parameters reach the value alone; they are not in the policy file."""
+    changes = {"observations": "critic", "env.history": 1, "env.context": ["tool_*.mass"]}
+    made = RECIPE.but(**changes)
+    model = ManyPpo(made, backend="fake", seed=0, device="cpu", threads=1)
+    envs = [ScmWorldEnv("pushing", backend="fake", **o) for o in (made.options, made.trained_in)]
+    for env in envs:
+        env.reset(seed=0)
+        env.step(np.full(9, 0.3, np.float32))
+    bare, whole = (env.observe()[None] for env in envs)
+    assert (made.options["context"], envs[1].appended) == ("none", ("tool_block.mass",))
+    envs[1].do({"tool_block.mass": 0.09})
+    changed, policy = envs[1].observe()[None], model.policy({})
+    with torch.no_grad():
+        actions = [model._actor(model._seen(one)).clamp(-1, 1).numpy() for one in (whole, changed)]
+        values = [model._critic(model._seen(one)).numpy() for one in (whole, changed)]
+    np.testing.assert_allclose(policy(bare), actions[0], atol=1e-5)
+    np.testing.assert_array_equal(*actions)
+    assert values[0] != values[1]
+    assert (policy.value, model.round()["value"] > 0.0) == ((), True)
 
 
 def test_rewards_are_scaled_and_cut_episodes_have_the_value_of_their_last_observation() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import errno
 import io
 import json
@@ -9,7 +10,9 @@ import signal
 import subprocess
 import sys
 import zipfile
+from contextlib import closing
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import gymnasium
@@ -18,23 +21,28 @@ import pytest
 import safetensors.numpy
 
 from scm_world._arguments import missing
+from scm_world.curricula import CurriculumEnv, stages
+from scm_world.curricula.curriculum import as_curriculum
+from scm_world.env import ScmWorldEnv
 from scm_world.errors import (
+    ActionError,
     Diverged,
     InterventionError,
     MissingExtra,
+    ModelError,
     ScmWorldError,
     UnknownOption,
     UnreadableFile,
     UnwritableFolder,
 )
-from scm_world.evaluation import evaluate
-from scm_world.policies import load_policy, save_policy
+from scm_world.evaluation import Protocol, evaluate
+from scm_world.policies import MlpPolicy, as_agent, load_policy, save_policy
 from scm_world.runs.study import Study, settings_in
-from scm_world.training.export import begin_with
+from scm_world.training.export import SEED, begin_with
 from scm_world.training.loop import train
 from scm_world.training.recipe import Recipe, recipe
 from scm_world.training.settings import Rate
-from scm_world.training.worlds import SCALES, scales
+from scm_world.training.worlds import SCALES, level_seed, scales
 
 sb3 = pytest.importorskip("stable_baselines3")
 
@@ -64,6 +72,15 @@ RECIPES: dict[str, Recipe] = {
         batch_size=16,
         rate={"schedule": "adaptive"},
         scale_rewards=True,
+        critic_warmup=64,
+    ),
+    "recurrent": recipe(
+        "pushing",
+        "recurrent_ppo",
+        **{**SMALL, "network": {"hidden": [8], "recurrent": 6}},
+        steps=256,
+        n_steps=8,
+        batch_size=16,
         critic_warmup=64,
     ),
     "sac": recipe("pushing", "sac", **OFF),
@@ -160,7 +177,97 @@ def test_the_same_seed_learns_the_same(tmp_path: Path) -> None:
         np.testing.assert_array_equal(array, other[key], err_msg=key)
 
 
-@pytest.mark.parametrize("name", RECIPES)
+def test_a_recurrent_policy_acts_as_its_model(tmp_path: Path) -> None:
+    """Over two episodes, with scaled observations; the file resumes, starts and has its value."""
+    made = RECIPES["recurrent"].but(**{"network.scaled": True})
+    path = run(made, tmp_path / "run").policy
+    worlds = algorithms.make_worlds(made, backend="fake")
+    model = algorithms.make_learner(made, worlds, seed=0)
+    begin_with(model, made, path)
+    worlds.close()
+    seen = np.random.default_rng(0).normal(0, 0.5, (12, 3, *model.observation_space.shape))
+    seen, policy = seen.astype(np.float32), load_policy(path)
+    mine = theirs = alone = None
+    for step, rows in enumerate(seen):
+        first = np.array([step in (0, 7), False, step == 5])
+        wanted, theirs = model.predict(rows, theirs, first, deterministic=True)
+        found, mine = policy.predict(rows, mine, first)
+        single, alone = policy.predict(rows[0], alone, first[0])
+        np.testing.assert_allclose(found, wanted, atol=1e-5)
+        np.testing.assert_array_equal(single, found[0])
+    assert np.ptp(found) > 0.01
+    assert policy.value_lstm
+    agent = as_agent(str(path))
+    with closing(ScmWorldEnv("pushing", backend="fake", **made.options)) as env:
+        played = []
+        for _ in range(2):
+            shown, _ = env.reset(seed=0)
+            agent.start(env)
+            played.append([agent.act(shown) for _ in range(3)])
+    np.testing.assert_array_equal(*played)  # emptied at the start of an episode
+    assert np.ptp(played[0], axis=0).max() > 0.0  # it remembers what it has seen
+    with pytest.raises(ActionError, match="has a memory"):
+        policy(shown)
+    for tensors in (
+        {**policy.tensors(), "lstm.1.bias": np.zeros(7, np.float32)},
+        {n: one for n, one in policy.tensors().items() if not n.startswith("lstm.1")},
+    ):
+        with pytest.raises(ModelError, match=r"lstm: expected two layers"):
+            MlpPolicy.of(tensors)
+
+
+def test_a_recurrent_training_resumes_and_repeats(tmp_path: Path) -> None:
+    """After a kill from its checkpoint; with the same seed the same bits."""
+    out, said = tmp_path / "run", list[str]()
+    killed("recurrent", out, 160)
+    assert run("recurrent", out, tell=said.append).steps == 256
+    assert said[1].startswith("goes on after")
+    one, two = (run("recurrent", tmp_path / name).policy for name in ("one", "two"))
+    for name, array in weights(one).items():
+        np.testing.assert_array_equal(array, weights(two)[name], err_msg=name)
+    given = RECIPES["recurrent"].but(**{"rate.initial": 1e-12, "rate.schedule": "constant"})
+    found = weights(run(given, tmp_path / "started", start=one).policy)
+    for name, array in weights(one).items():
+        np.testing.assert_allclose(found[name], array, atol=1e-6, err_msg=name)
+    with pytest.raises(UnknownOption, match=r"network\.recurrent with ppo"):
+        recipe("pushing", network={"recurrent": 6})
+
+
+def test_a_critic_can_observe_more_than_the_actor(tmp_path: Path) -> None:
+    """The causal parameters reach the value alone; the policy acts, resumes and starts without."""
+    changes = {"observations": "critic", "env.history": 1, "env.context": ["tool_*.mass"]}
+    made, out = RECIPES["ppo"].but(**changes, **{"network.scaled": True}), tmp_path / "run"
+    run(made, out, steps=128)
+    found = run(made, out)
+    assert found.steps == made.steps
+    policy = load_policy(found.policy)
+    assert (policy.about.option("context"), policy.value) == ("none", ())
+    with closing(algorithms.make_worlds(made, backend="fake")) as worlds:
+        model = algorithms.make_learner(made, worlds, seed=0)
+    begin_with(model, made, found.policy)
+    envs = [ScmWorldEnv("pushing", backend="fake", **o) for o in (made.options, made.trained_in)]
+    for env in envs:
+        env.reset(seed=0)
+        env.step(np.full(9, 0.3, np.float32))
+    assert envs[1].appended == ("tool_block.mass",)
+    bare, whole = (env.observe() for env in envs)
+    envs[1].do({"tool_block.mass": 0.09})
+    changed = envs[1].observe()
+    action, other = (model.predict(one, deterministic=True)[0] for one in (whole, changed))
+    np.testing.assert_allclose(policy(bare), action, atol=1e-5)
+    np.testing.assert_array_equal(action, other)
+    rows = model.policy.obs_to_tensor(np.stack([whole, changed]))[0]
+    one, two = model.policy.predict_values(rows).detach().numpy().ravel()
+    assert one != two
+    once, again = (weights(run(made, tmp_path / name).policy) for name in ("one", "two"))
+    for name, array in once.items():
+        np.testing.assert_array_equal(array, again[name], err_msg=name)
+    for algo, wrong in (("sac", {}), ("ppo", {"env": {"goal_env": True}})):
+        with pytest.raises(UnknownOption, match="critic"):
+            recipe("pushing", algo, observations="critic", **wrong)
+
+
+@pytest.mark.parametrize("name", [name for name in RECIPES if name != "recurrent"])
 @pytest.mark.parametrize("scaled", [False, True])
 def test_the_policy_file_acts_as_the_model(name: str, scaled: bool, tmp_path: Path) -> None:
     """On observations of every size; scales of observations are in its weights."""
@@ -249,6 +356,104 @@ def test_a_run_is_whole(tmp_path: Path) -> None:
     again = run("ppo", folder)
     assert (again.best, again.score) == (found.best, found.score)
     assert again.policy.read_bytes() == before
+
+
+class Tracker(ModuleType):
+    """The interface that wandb and trackio have in common, as they have it."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self.runs: list[dict[str, Any]] = []
+
+    def init(self, project: str, name: str, config: Any, resume: str, **more: Any) -> None:
+        """Begin a run, or go on with one of this name."""
+        assert (more == {"id": name}) == (self.__name__ == "wandb")
+        self.runs.append({"about": (project, name, resume), "algo": config["recipe"]["algo"]})
+        self.runs[-1] |= {"steps": [], "rows": [], "finished": False}
+
+    def log(self, numbers: dict[str, Any], step: int) -> None:
+        """Keep numbers."""
+        self.runs[-1]["steps"].append(step)
+        self.runs[-1]["rows"].append(numbers)
+
+    def finish(self) -> None:
+        """End the run."""
+        self.runs[-1]["finished"] = True
+
+
+def test_trackers_and_a_callback_get_the_numbers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of the learning curve; a resumed run goes on under its name."""
+    trackers = {name: Tracker(name) for name in ("wandb", "trackio")}
+    for name, tracker in trackers.items():
+        monkeypatch.setitem(sys.modules, name, tracker)
+    heard: list[dict[str, Any]] = []
+    out, log = tmp_path / "run", "wandb,trackio"
+    run("ppo", out, steps=128, log=log, callback=heard.append)
+    run("ppo", out, log=["wandb", "trackio"], callback=heard.append)
+    first, second = trackers["wandb"].runs
+    assert first["about"] == second["about"]
+    assert first["about"][::2] == ("scm-world", "allow")
+    assert (first["algo"], first["finished"], second["finished"]) == ("ppo", True, True)
+    assert first["steps"] == [32, 64, 96, 128, 128]  # at last with the evaluation
+    assert second["steps"] == [160, 192, 224, 256, 256]
+    rows = [*first["rows"], *second["rows"]]
+    assert heard == rows == [row for one in trackers["trackio"].runs for row in one["rows"]]
+    with (out / "progress.csv").open() as file:
+        curve = list(csv.DictReader(file))
+    for row, line in zip(first["rows"], curve, strict=True):
+        assert {name: float(text) for name, text in line.items() if text} == pytest.approx(row)
+    assert "evaluation/P0" in rows[-1]
+    assert not (out / "tensorboard").exists()
+
+    class Stop(sb3.common.callbacks.BaseCallback):  # type: ignore[name-defined,misc]
+        def _on_step(self) -> bool:
+            return bool(self.num_timesteps < 64)
+
+    assert run("ppo", tmp_path / "stopped", callback=Stop()).steps == 64
+    with pytest.raises(UnknownOption, match="callback"):
+        run("ppo", tmp_path / "no", callback=3)
+    with pytest.raises(UnknownOption, match="log of ppo"):
+        run("ppo", tmp_path / "no", log="mlflow")
+    monkeypatch.setitem(sys.modules, "trackio", None)
+    with pytest.raises(MissingExtra, match="pip install trackio"):
+        run("ppo", tmp_path / "no", log="trackio")
+
+
+def test_levels_are_a_fixed_set_of_episodes(tmp_path: Path) -> None:
+    """All worlds play them; trials have the scores on them and on new draws, and the gap."""
+    made = RECIPES["ppo"].but(levels=3, curriculum="P5", steps=128)
+    worlds = algorithms.make_worlds(made, backend="fake", seed=3)
+    worlds.seed(0)
+    met = [worlds.reset(), *(worlds.step(np.zeros((4, 9)))[0] for _ in range(80))]
+    (layout,) = worlds.get_attr("layout", 0)
+    worlds.close()
+    goals = np.stack(met)[..., layout["goal_block.cartesian_position"]].reshape(-1, 3)
+    curriculum = as_curriculum(made.curriculum)
+    with closing(ScmWorldEnv("pushing", backend="fake", **made.options)) as inside:
+        env, wanted = CurriculumEnv(inside, curriculum), []
+        for level in range(3):
+            shown, _ = env.reset(seed=level_seed(3), options={"episode": level})
+            wanted.append(shown[layout["goal_block.cartesian_position"]])
+    assert {*map(tuple, goals.tolist())} == {*map(tuple, np.array(wanted).tolist())}
+
+    found = run(made, tmp_path / "run")
+    card: Any = load_policy(found.best).about.card["trial"]
+    trial = json.loads((tmp_path / "run" / "evaluations" / f"{card['steps']}.json").read_text())
+    drawn = Protocol("drawn", act=curriculum)
+    how: Any = {"task": "pushing", "backend": "fake", "n": 1}
+    for name, seed in {"training_levels": level_seed(3), "new_draws": SEED}.items():
+        score = evaluate(found.best, drawn, seeds=seed, **how).score("drawn").value
+        assert trial[name] == card[name] == pytest.approx(score)
+    assert card["gap"] == trial["gap"] == trial["training_levels"] - trial["new_draws"]
+    assert "evaluation/gap" in (tmp_path / "run" / "progress.csv").read_text()
+    again = run(made, tmp_path / "again")
+    for name, array in weights(found.policy).items():
+        np.testing.assert_array_equal(array, weights(again.policy)[name], err_msg=name)
+    staged = stages({"floor_friction": 0.4}, {"floor_friction": 0.6}, up=0.8)
+    with pytest.raises(UnknownOption, match="levels of a curriculum with stages"):
+        recipe("pushing", levels=3, curriculum=staged)
 
 
 def test_one_training_is_not_another(tmp_path: Path) -> None:

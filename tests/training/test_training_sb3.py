@@ -173,17 +173,22 @@ def small(**network: Any) -> dict[str, Any]:
     return {"policy_kwargs": {"net_arch": [8], **network}, "device": "cpu", "seed": 0}
 
 
-@pytest.mark.parametrize("algo", ["PPO", "A2C", "SAC", "TD3"])
+@pytest.mark.parametrize("algo", ["PPO", "A2C", "SAC", "TD3", "RecurrentPPO"])
 def test_models_become_policy_files(algo: str, tmp_path: Path) -> None:
     """They act as the models, in the environment of the training, wherever they are named."""
     env = gymnasium.make("scm_world/Pushing-v0", **RELATIVE)
-    model = getattr(sb3, algo)("MlpPolicy", env, **small())
+    if algo == "RecurrentPPO":
+        contrib = pytest.importorskip("sb3_contrib")
+        model = contrib.RecurrentPPO("MlpLstmPolicy", env, **small(lstm_hidden_size=4))
+    else:
+        model = getattr(sb3, algo)("MlpPolicy", env, **small())
     path = export_sb3(model, env, tmp_path / "mine.safetensors", note="random")
     policy = load_policy(path)
     assert policy.about.option("action_mode") == "delta_joint_positions"
     assert (policy.about.task, policy.about.card["note"]) == ("pushing", "random")
     seen = np.stack([env.observation_space.sample() for _ in range(5)])
-    np.testing.assert_allclose(policy(seen), model.predict(seen, deterministic=True)[0], atol=1e-5)
+    wanted = model.predict(seen, deterministic=True)[0]
+    np.testing.assert_allclose(policy.predict(seen)[0], wanted, atol=1e-5)
     scores = [
         evaluate(one, "P5", n=2, backend="fake", env={"max_episode_length": 4}).frame["return"]
         for one in (model, path)

@@ -120,11 +120,13 @@ class Causes:
         left_out: Why the data say nothing about a column or variable, by its name.
         dependent: Pairs of variables that were not drawn independently, with the probability of
             such a dependence in independent data, corrected for all pairs.
+        verdicts: Whether the agent infers each variable, of ``Inferred.verdicts``, if known.
     """
 
     causes: tuple[Cause, ...]
     left_out: Mapping[str, str]
     dependent: Mapping[tuple[str, str], float] = field(default_factory=dict)
+    verdicts: Mapping[str, str] = field(default_factory=dict)
 
     def ranked(self) -> tuple[Cause, ...]:
         """Return the variables, the one that explains most of the score first."""
@@ -136,7 +138,8 @@ class Causes:
         return tuple(cause for cause in self.ranked() if cause.p_holm <= level)
 
     def __str__(self) -> str:
-        head = ("variable", "share of variance", "p (Holm)", "upper - lower third", "of column")
+        head = ["variable", "share of variance", "p (Holm)", "upper - lower third", "of column"]
+        head += ["inferred by the agent"] if self.verdicts else []
         rows = [
             (
                 cause.variable,
@@ -144,12 +147,12 @@ class Causes:
                 f"{cause.p_holm:.3f}",
                 str(cause.column.contrast),
                 cause.column.name,
+                *((self.verdicts.get(cause.variable, "not probed"),) if self.verdicts else ()),
             )
             for cause in self.ranked()
         ]
-        widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
-        lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in (head, *rows)]
-        lines = lines if rows else []
+        lines = aligned(head, rows) if rows else []
+        lines += missing(self.verdicts, [cause.variable for cause in self.found()])
         lines += [f"{name}: left out, {reason}" for name, reason in self.left_out.items()]
         lines += [
             f"{one} and {other} depend on one another (p = {p:.2g}): their shares of the "
@@ -157,6 +160,18 @@ class Causes:
             for (one, other), p in self.dependent.items()
         ]
         return "\n".join(lines)
+
+
+def aligned(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return the lines of a table."""
+    widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
+    return ["  ".join(map(str.ljust, row, widths)).rstrip() for row in (head, *rows)]
+
+
+def missing(verdicts: Mapping[str, str], names: Sequence[str]) -> list[str]:
+    """Return a line for each of the causes that decide a score and are not inferred."""
+    wanting = [name for name in names if verdicts.get(name, "inferred") != "inferred"]
+    return [f"{one} matters, and the agent does not infer it ({verdicts[one]})" for one in wanting]
 
 
 @typed
@@ -201,7 +216,7 @@ def find_causes(
         left_out |= {
             name: reason
             for name, column in zip(names, table.T, strict=True)
-            if (reason := _useless(column))
+            if (reason := useless(column))
         }
         kept = [k for k, name in enumerate(names) if name not in left_out]
         table = table[:, kept]
@@ -286,7 +301,7 @@ def _table(variable: str, values: ArrayLike, n: int) -> tuple[list[str], Floats]
     return [f"{variable}[{k}]" for k in range(array.shape[1])], array.astype(np.float64)
 
 
-def _useless(column: Floats) -> str:
+def useless(column: Floats) -> str:
     """Return why a column says nothing; empty if it can be used."""
     values = column[~np.isnan(column)]
     if values.size < FEWEST:

@@ -50,9 +50,9 @@ SMALL = recipe(
 )
 
 
-def _pair(task: str, curriculum: Any) -> tuple[Any, Any]:
+def _pair(task: str, curriculum: Any, env: Any = None) -> tuple[Any, Any]:
     """Return environments on the device, and equal ones on the host."""
-    sizes = {"worlds": N, "n_steps": 8, "batch_size": 8 * N, "episode_length": 6}
+    sizes = {"env": env or {}, "worlds": N, "n_steps": 8, "batch_size": 8 * N, "episode_length": 6}
     made = recipe(task, "rsl_ppo", curriculum=curriculum, **sizes)
     envs = [make_envs(made, backend="warp:cpu") for _ in range(2)]
     for one in envs:
@@ -80,11 +80,17 @@ def _same(found: Any, wanted: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("task", "curriculum"), [("reaching", "P7"), ("pushing", "2"), ("picking", "P10")]
+    ("task", "curriculum", "env"),
+    [
+        ("reaching", "P7", {}),
+        ("pushing", "2", {}),
+        ("picking", "P10", {}),
+        ("reaching", "P7", {"history": 2, "action_mode": "delta_joint_positions"}),
+    ],
 )
-def test_a_control_step_is_that_of_the_host(task: str, curriculum: str) -> None:
+def test_a_control_step_is_that_of_the_host(task: str, curriculum: str, env: Any) -> None:
     """Bit for bit what is observed, also with everything from A; and after the device is left."""
-    there, here = _pair(task, curriculum)
+    there, here = _pair(task, curriculum, env)
     assert there.why_not == ""
     for step in range(14):
         _same(there.step(torch.as_tensor(_actions(step))), here.step(_actions(step)))
