@@ -153,7 +153,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {  # each with arguments that make it sho
     "learners": ("mujoco", "60"),
     "new_family": (),
     "own_backend": ("1", "10"),
-    "own_curriculum": ("4096", "", "1"),
+    "own_curriculum": ("2048", "", "1"),
     "own_learner": (),
     "own_rl_learner": ("3",),
     "own_task": ("2",),
@@ -162,7 +162,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {  # each with arguments that make it sho
     "recording": (),
     "representations": ("60", "1", "1"),
     "sim_to_sim": ("sweep", "pushing", "2"),
-    "train_and_evaluate": ("4096", "", "1"),
+    "train_and_evaluate": ("1024", "", "1"),
     "transfer_a_to_b": ("sweep", "pushing", "2"),
     "vector": (),
 }

@@ -333,7 +333,7 @@ CASES: dict[str, Case] = {
         lambda **k: str(
             evaluation.evaluate("still", "P5", env={"max_episode_length": 2}, backend="fake", **k)
         ),
-        {"n": 2, "workers": 1},
+        {"n": 2, "workers": 1, "steps": True},
     ),
     "inferred": (
         lambda **k: str(
@@ -342,6 +342,10 @@ CASES: dict[str, Case] = {
             )
         ),
         {"n": 2, "seed": 1, "steps": [1], "at": 1, "after": 1, "workers": 1},
+    ),
+    "Adaptive": (
+        lambda **k: evaluation.Adaptive("still", "mass", measures={"x": 0.1}, **k).keeps,
+        {"after": 3, "keeps": True},
     ),
     "play": (
         lambda **k: evaluation.play(gymnasium.make(PUSHING, **SHORT), STILL, **k)[

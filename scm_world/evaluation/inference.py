@@ -24,7 +24,7 @@ import numpy as np
 from scm_world._arguments import typed, whole_number
 from scm_world._patterns import as_names
 from scm_world._types import Floats, Observation
-from scm_world.curricula import at_step, resample, together
+from scm_world.curricula import Situation, at_step, resample, together
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import UnknownOption
 from scm_world.evaluation.episodes import Hook, placed, play, under
@@ -52,6 +52,7 @@ from scm_world.runs.pool import Pool, pool_of
 from scm_world.runs.processes import single_threaded
 from scm_world.runs.study import Study
 from scm_world.tasks import AnySource
+from scm_world.variables import Noise
 
 STEPS = (5, 25, 100)
 FLIPS = 1000
@@ -337,8 +338,8 @@ def inferred(
         progress: Called with how many episodes are done, and how many there are.
 
     Raises:
-        UnknownOption: An argument names something that does not exist, or nothing is drawn at the
-            reset, or steps lie beyond the episode.
+        UnknownOption: An argument names something that does not exist, nothing is drawn, or steps
+            lie beyond the episode.
         EvaluationError: As in ``evaluate``.
         InexactEngine: With twins: equal runs differ on the backend.
 
@@ -366,12 +367,12 @@ def inferred(
         if start:
             whole_number("at + after", start + later, least=1, most=length - 1)
             here.world.require_exact("a twin of an episode", independent=True)
-        under(here, protocol.at(0)).reset(seed=seed, options={"episode": 0})
         compiled = here.world.compiled
-        acts = {n: act for _, given in here.interventions for n, act in given.items()}
+        plan = protocol.curriculum().plan(Situation(0, {}, compiled, Noise(seed), 0))
+        acts = {n: act for n, several in plan.items() for act in several if act.draws}
         names = tuple(n for n in acts if n in compiled.model and n not in compiled.actions)
         if not names:
-            allowed = ("causes that are drawn at the reset, such as '*.mass'",)
+            allowed = ("causes that are drawn, such as '*.mass'",)
             raise UnknownOption("variables", variables, allowed)
         columns, logs = [], []
         for name in names:

@@ -9,19 +9,20 @@ import multiprocessing
 import os
 import pickle
 import signal
+import sys
 import threading
 import traceback
 import weakref
 from collections.abc import Callable, Iterator
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
+from functools import lru_cache
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from multiprocessing.reduction import ForkingPickler
-from multiprocessing.resource_tracker import ensure_running
 from typing import Any, final
 
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 from scm_world.errors import EngineFailure, UnknownOption, in_one_line
 
@@ -47,16 +48,35 @@ def piped(
         The process, and the pipe to it, whose other end is the last argument of the function.
     """
     context = multiprocessing.get_context("spawn")
-    pipe, other = context.Pipe()
+    ends: Any = context.Pipe()  # of another class on Windows
+    pipe, other = ends
     process = context.Process(target=target, args=(*given, other), daemon=daemon)
-    ensure_running()  # at its start it would unblock the signal for the process that starts now
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        with other:
-            process.start()
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+    with _deaf(), other:
+        process.start()
     return process, pipe
+
+
+@contextmanager
+def _deaf() -> Iterator[None]:
+    """Let processes that are started meanwhile inherit that Ctrl-C is ignored."""
+    if sys.platform == "win32":
+        from ctypes import windll
+
+        ignore = windll.kernel32.SetConsoleCtrlHandler
+        ignore(None, True)
+        try:
+            yield
+        finally:
+            ignore(None, False)
+    else:
+        from multiprocessing.resource_tracker import ensure_running
+
+        ensure_running()  # at its start it would unblock the signal for the process that starts now
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            yield
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 @final
@@ -95,8 +115,14 @@ def _set_variables() -> Iterator[None]:
         os.environ.update(before)
 
 
+@lru_cache(maxsize=1)
+def _libraries(modules: int) -> ThreadpoolController:
+    """Find the numerical libraries, which takes milliseconds; again when modules were imported."""
+    return ThreadpoolController()
+
+
 _VARIABLES = _Shared(_set_variables)
-_LIMITS = _Shared(lambda: threadpool_limits(limits=1))
+_LIMITS = _Shared(lambda: _libraries(len(sys.modules)).limit(limits=1))
 
 
 @contextmanager

@@ -278,7 +278,7 @@ def is_causal(source: object) -> bool:
     if isinstance(source, str) and not is_model(source) and source not in tasks():
         if source in models():
             return _causal(models()[source]) is not None
-        if ":" in source and not is_family(source):
+        if ":" in source and not (is_family(source) or _is_saved(source)):
             source = load_named(source, "task")
         else:
             return _is_saved(source) or (is_family(source) and source.partition(":")[0] in FAMILIES)

@@ -20,6 +20,17 @@ def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
+def drawn() -> None:
+    """Render figures, in a test that looks at one or that runs a whole command."""
+
+
+@pytest.fixture(autouse=True)
+def _rendered_or_not(request: pytest.FixtureRequest) -> None:
+    if "drawn" not in request.fixturenames:
+        request.getfixturevalue("sketched")
+
+
+@pytest.fixture
 def _undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw nothing, where a test is about something else."""
     from scm_world.evaluation import figures

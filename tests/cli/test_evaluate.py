@@ -47,6 +47,7 @@ def results(saved: Path, tmp_path: Path) -> Evaluation:
     return Evaluation.load("out")
 
 
+@pytest.mark.usefixtures("drawn")
 def test_evaluate_writes_everything_and_prints_a_table() -> None:
     """JSON, the table of episodes, plots and the report; the table names all scores."""
     done = call(

@@ -57,6 +57,7 @@ def test_failed_learners_are_printed_with_the_reason() -> None:
     assert "er2:4: 4 variables" in said
 
 
+@pytest.mark.usefixtures("drawn")
 def test_the_command_of_the_guide_runs_its_learner() -> None:
     """The guide's function in a file of the present folder is benchmarked beside do_order."""
     text = (Path(__file__).parents[2] / "docs" / "guides" / "causality.md").read_text()

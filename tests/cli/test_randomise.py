@@ -73,6 +73,7 @@ def test_hidden_attributes_are_listed_with_what_exposes_them(arm: str) -> None:
     assert "no attributes but these" in call("variables", "pushing", "--all").stdout
 
 
+@pytest.mark.usefixtures("drawn")
 def test_a_sweep_draws_its_picture(arm: str, tmp_path: Path) -> None:
     """It lies beside the table, unless it is left out; the same table gives the same bytes."""
     options = ("--outcome", "elbow.position", "-n", "3", "--steps", "3", "--out", "swept")

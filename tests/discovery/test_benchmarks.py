@@ -40,6 +40,8 @@ from scm_world.runs.processes import Worker
 from scm_world.tasks.families import random_model
 from scm_world.variables import Normal
 
+pytestmark = pytest.mark.usefixtures("sketched")
+
 SMALL: dict[str, Any] = {
     "problems": ["er2:5"],
     "learners": ["do_order", "paired"],

@@ -6,6 +6,7 @@ import copy
 import pickle
 from collections.abc import Callable
 from typing import Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 import pytest
@@ -95,12 +96,13 @@ def test_the_world_of_an_environment_can_be_asked(backend: str) -> None:
         np.testing.assert_array_equal(mine, its)
 
 
-def test_structures_end_with_their_environment() -> None:
+def test_structures_end_with_their_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     """Models of goal families, and all that is computed on for them, are freed with it."""
     import gc
 
     from scm_world.tasks.trifinger import system
 
+    monkeypatch.setattr("scm_world.world.structures._ALIVE", WeakValueDictionary())
     gc.collect()  # what earlier tests left must not vanish in between
     before = set(system._MADE)
     env: Any = make("scm_world/StackedBlocks-v0", backend="mujoco", random_goal="A|B")

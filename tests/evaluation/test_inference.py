@@ -15,7 +15,7 @@ from scm_world import Action, Box, Exogenous, Measured, StepTask
 from scm_world.cli.app import app
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import ScmWorldError, UnreadableFile
-from scm_world.evaluation import Inferred, evaluate, inferred
+from scm_world.evaluation import Inferred, Protocol, evaluate, inferred
 from scm_world.evaluation.statistics.probes import probe
 from scm_world.policies import MlpPolicy, WorldPolicy, as_agent
 from scm_world.variables import Continuous
@@ -101,7 +101,6 @@ def learner() -> Inferred:
 
 def masses(episodes: Any) -> np.ndarray:
     """Return the masses that the protocol draws."""
-    from scm_world.evaluation import Protocol
     from scm_world.evaluation.episodes import under
 
     env = ScmWorldEnv(Cart())
@@ -158,6 +157,14 @@ def test_a_policy_of_the_world_reacts_without_memory() -> None:
     assert found.about["twins"] == [3, 5]
 
 
+def test_a_cause_may_be_drawn_within_episodes() -> None:
+    """Before, it has its default, about which there is nothing to infer."""
+    late = Protocol("late", "mass", step=4)
+    found = inferred(Learner(), late, task=Cart(), steps=(2,), at=0, **HOW)
+    assert found.left_out["mass at step 2"] == "it was 1 in every episode"
+    assert [(one.step, one.verdict) for one in found.probes] == [(-1, "inferred")]
+
+
 def test_without_memory_nothing_is_inferred_and_what_is_seen_is_not() -> None:
     """The mass is not in the velocity; where a scale shows it, the observation is the reason."""
     found = inferred(Blind(), "mass", task=Cart(), at=0, **HOW)
@@ -191,6 +198,7 @@ def test_networks_have_an_untrained_control() -> None:
     assert not np.array_equal(other.hidden(seen), policy.hidden(seen))
     assert np.array_equal(other.hidden(seen), policy.untrained(3).hidden(seen))
     found = inferred(policy, "mass", task=Weighed(), at=0, n=24, env=FROM_REST)
+    assert {one.variable for one in found.probes} == {"mass"}  # not what the environment sets
     scores = found.probes[-1].scores
     assert scores["untrained"]["kernel"].value > 0.9
     assert found.verdicts()["mass"].startswith("no")

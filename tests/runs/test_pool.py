@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -19,6 +20,12 @@ from run_samples import Adder, Task, do, pids, tries
 from scm_world.errors import ActionError, EngineFailure, MissingExtra, UnknownOption
 from scm_world.runs.pool import TRIES, Pool, pool_of
 from scm_world.runs.processes import THREADS, Worker, cores
+
+
+@pytest.fixture(autouse=True)
+def _spawned(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Start processes as users do, not from one that has imported the package."""
+    monkeypatch.setattr("scm_world.runs.processes.multiprocessing", multiprocessing)
 
 
 def wait_for(what: Callable[[], Any], seconds: float = 60.0) -> None:

@@ -360,7 +360,9 @@ def merged(n: int, links: Iterable[Iterable[int]]) -> list[Trees]:
     """Merge linked trees, directly or through others; return the group of each."""
     group = [frozenset([i]) for i in range(n)]
     for link in links:
-        joined = NONE.union(*(group[i] for i in link))
-        for member in joined:
-            group[member] = joined
+        apart = {group[i] for i in link}
+        if len(apart) > 1:
+            joined = NONE.union(*apart)
+            for member in joined:
+                group[member] = joined
     return group
