@@ -75,7 +75,7 @@ print(env.observation_space.shape, env.action_space)
 
 # %%
 def play(gains, seed):
-    observation, info = env.reset(seed=seed)
+    observation, _ = env.reset(seed=seed)
     total, ended = 0.0, False
     while not ended:
         observation, reward, terminated, truncated, _ = env.step([-(gains @ observation)])
