@@ -333,7 +333,7 @@ CASES: dict[str, Case] = {
         lambda **k: str(
             evaluation.evaluate("still", "P5", env={"max_episode_length": 2}, backend="fake", **k)
         ),
-        {"n": 2, "workers": 1},
+        {"n": 2, "workers": 1, "steps": True},
     ),
     "inferred": (
         lambda **k: str(

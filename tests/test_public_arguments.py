@@ -394,7 +394,11 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
     rest = {"backend": "fake", "env": {"max_episode_length": 1}, "out": None, "trusted": None}
     yield evaluation.evaluate, {
         "policy": "random", "protocols": ["P0"], "task": "pushing", "n": 1, "seeds": 0, **rest,
-        "workers": 1, "engine": None, "progress": None,
+        "workers": 1, "engine": None, "progress": None, "repeats": None, "steps": False,
+    }  # fmt: skip
+    yield evaluation.Adaptive, {
+        "policy": "random", "parameters": "mass", "measures": {"x": 0.1}, "after": 5,
+        "every": None, "iterations": 2, "last": None, "use": "mean",
     }  # fmt: skip
     yield evaluation.in_world, {"policy": "random", "world": world}
     yield evaluation.inferred, {
@@ -403,7 +407,8 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
         "engine": None, "progress": None,
     }  # fmt: skip
     yield evaluation.play, {
-        "env": env, "agent": agent, "plan": None, "hooks": (), "seed": 0, "episode": None
+        "env": env, "agent": agent, "plan": None, "hooks": (), "seed": 0, "episode": None,
+        "draws": None,
     }  # fmt: skip
     yield evaluation.protocols_of, {"task": "pushing", "backend": "fake"}
     yield evaluation.record, {
@@ -445,7 +450,7 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
     yield policies.WorldPolicy, {"policy": abs}
     yield policies.Agent, {"about": {"name": "a"}, "begin": abs, "policy": None, "card": None}
     yield policies.agent_from, {"about": agent.about, "trusted": ()}
-    yield policies.as_agent, {"policy": "random", "trusted": None}
+    yield policies.as_agent, {"policy": "random", "trusted": None, "env": None}
     network = policies.MlpPolicy((layer,))
     kept = policies.save_policy(folder / "policy.safetensors", network, about)
     yield policies.file_of, {"policy": kept}

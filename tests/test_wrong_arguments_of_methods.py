@@ -517,8 +517,9 @@ def of_evaluations(place: Path) -> Iterator[Case]:
     """Yield the methods of an evaluation, its scores and its protocols."""
     agents, short = {"one": "random", "two": "still"}, {"max_episode_length": 3}
     found = evaluation.evaluate(
-        agents, ["P0", "P1"], task="pushing", n=2, backend="fake", env=short
-    )
+        *(agents, ["P0", "P1"]), task="pushing", n=4, backend="fake", env=short, repeats=2,
+        steps=True,
+    )  # fmt: skip
     found.save(place / "found")
     named: Any = {"metric": None, "agent": "one", "engine": None}
     yield from of(
@@ -528,6 +529,16 @@ def of_evaluations(place: Path) -> Iterator[Case]:
         overall=named,
         causes={"protocol": "P1", **named},
         difference={"one": "one", "other": "two", "protocol": "P1", "metric": None, "engine": None},
+        regret={
+            "agent": "one",
+            "reference": "two",
+            "protocol": "P1",
+            "metric": None,
+            "engine": None,
+        },
+        probability_of_improvement={"one": "one", "other": "two", "protocol": "P1"},
+        attempts={"protocol": "P1", **named},
+        since={"protocol": "P1", "agent": "one", "engine": None, "every": 2},
         metric={"name": None},
         only={"agent": "one", "protocol": "P1", "seed": 0, "episode": 0},
         runs={"agent": "one"},
@@ -562,7 +573,7 @@ def test_wrong_arguments_are_refused(
 
 LEFT_OUT = {
     **dict.fromkeys(
-        ("advance", "batched", "by_structure", "move", "noise_key", "take"),
+        ("advance", "batched", "by_structure", "move", "noise_key", "draw_key", "take"),
         "for loops of this package",
     ),
     **dict.fromkeys(

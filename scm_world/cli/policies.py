@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,6 +20,10 @@ from scm_world.errors import ConflictingTargets, UnknownOption
 
 if TYPE_CHECKING:
     from scm_world.training.loop import Trained
+
+
+SHOWN = 10
+"""Rows about the control steps of an episode, about."""
 
 
 @dataclass
@@ -201,6 +206,9 @@ def evaluate(
     env: options.Pairs = None,
     option: options.Pairs = None,
     metric: options.Text = None,
+    repeats: Annotated[int | None, typer.Option(min=1)] = None,
+    steps: bool = False,
+    reference: options.Text = None,
     trust: options.Words = None,
     out: options.Out = None,
     jobs: options.ManyJobs,
@@ -227,6 +235,10 @@ def evaluate(
         env: Option of the environment, such as frame_skip=3.
         metric: Score that is shown and drawn; all are written. By default
             last_fractional_success, or return where a task has none.
+        repeats: For how many episodes in a row each draw holds, for agents that remember.
+        steps: Keep the reward of each control step, and show it since an intervention within
+            episodes.
+        reference: Name of the policy with which the others are compared.
     """
     from scm_world import evaluation
     from scm_world.evaluation import METRICS
@@ -236,6 +248,7 @@ def evaluate(
     sys.path.insert(0, str(Path.cwd()))  # for modules of the working directory
     one_of("metric", metric, (None, *METRICS))
     agents = policies_of(policy)
+    one_of("--reference", reference, (None, *agents))
     task = task or task_of(agents)
     made = load_system(task, option).task()
     settings = parse_assignments(env, "'--env'")
@@ -245,6 +258,7 @@ def evaluate(
     folder = console.results_folder(out, "evaluate", *words)
     named = (text.partition(":")[0] for runs in agents.values() for text in runs if ":" in text)
     how: dict[str, Any] = {"task": task, "n": n, "seeds": seeds, "env": settings}
+    how |= {"repeats": repeats, "steps": steps}
     if trust:
         how["trusted"] = (*trust, *(name.partition(".")[0] for name in named))
     with jobs.open("episodes", folder, "parts/*.json", "files") as job:
@@ -255,7 +269,7 @@ def evaluate(
     files = *found.save(folder), *write_figures(found, folder, metric)
     docs = {one["name"]: one.get("doc", "") for one in found.about["protocols"]}
     engines = found.engines
-    rows, gaps = [], []
+    rows, gaps, regrets, learned, curves = [], [], [], [], []
     for name in found.protocols:
         scores = {
             agent if len(engines) == 1 else f"{agent}, {engine}": found.score(
@@ -268,7 +282,31 @@ def evaluate(
         if len(engines) == 2:
             apart = {a: found.difference(*engines, name, metric, agent=a) for a in found.agents}
             gaps.append({"protocol": name, **apart})
+        for engine, agent in product(engines, found.agents):
+            who = {"protocol": name, "policy": agent} | (
+                {"backend": engine} if len(engines) > 1 else {}
+            )
+            if reference not in (None, agent):
+                pair = {"regret": found.regret(agent, str(reference), name, metric, engine=engine)}
+                wins = found.probability_of_improvement
+                pair["better"] = wins(agent, str(reference), name, metric, engine=engine)
+                regrets.append({**who, **pair})
+            if repeats and repeats > 1:
+                *each, last = found.attempts(name, metric, agent=agent, engine=engine)
+                numbered = {f"episode {k}": score for k, score in enumerate(each, 1)}
+                learned.append({**who, **numbered, "last - first": last})
+            if steps and "@" in name:
+                size = -(-(found.rewards.shape[1]) // SHOWN)  # type: ignore[union-attr] # asked for
+                shown = found.since(name, agent=agent, engine=engine, every=size)
+                curves += [{**who, **row} for row in shown.to_dict("records")]
     console.frame(rows, title=f"{metric.replace('_', ' ')} in {found.task}, with 95 % intervals")
+    if regrets:
+        said = f"regret to {reference}, and probability to score higher than it, by draw"
+        console.frame(regrets, title=said)
+    if learned:
+        console.frame(learned, title=f"{repeats} episodes of each draw, one after another")
+    if curves:
+        console.frame(curves, title="mean reward by control step since the intervention")
     if gaps:
         console.frame(gaps, title=f"{' minus '.join(engines)}, the same draws on both")
     console.written(*files)

@@ -121,7 +121,8 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         Args:
             seed: Seed of the noise.
             options: As without this wrapper. ``"do"`` lies above the curriculum: a shift acts on
-                what that makes of a variable. ``"episode"`` is its number for the curriculum, too.
+                what that makes of a variable. ``"draws"``, or else ``"episode"``, is its number for
+                the curriculum, too.
 
         Raises:
             InterventionError: An intervention was refused.
@@ -144,7 +145,9 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             seed = place[0]
             given |= {"episode": place[1]} if place[1] else {}
         compiled, seeded = world.structures.natural(None), Noise(place[0])
-        situation = Situation(found.episode, found.stages, compiled, seeded, place[1])
+        drawn = given.get("draws")
+        numbers = (found.episode, place[1]) if drawn is None else (drawn, drawn)
+        situation = Situation(numbers[0], found.stages, compiled, seeded, numbers[1])
         given["do"] = self._plan(situation, Plan(given.get("do")))
         shown = self.env.reset(seed=seed, options=given)
         self._state, self._staged = found.model_copy(update={"noise": place}), situation.staged

@@ -16,7 +16,7 @@ from scm_world.variables.kinds import SPACES
 from scm_world.world import Simulation
 from scm_world.world.compiled_task import CompiledTask
 
-RESETS = ("do", "episode", "space")
+RESETS = ("do", "episode", "space", "draws")
 """Options of a reset."""
 
 

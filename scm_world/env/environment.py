@@ -414,7 +414,8 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
                 whose times lie within it. Where it
                 sets what ``start`` or a random goal sets too, it counts. ``{"episode": n}``: the
                 number of the episode within the noise; the next one if not given, 0 with a seed.
-                ``{"space": …}``: the space in which every target must lie.
+                ``{"space": …}``: the space in which every target must lie. ``{"draws": n}``: the
+                number of the episode whose draws hold, see ``World.reset``.
 
         Raises:
             UnknownOption: Another key.
@@ -430,9 +431,8 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         self._done = []
         if self.history is not None:
             self.history.rows[:] = 0.0
-        self.world.reset(
-            seed=seed, episode=0 if number is None else number, do=request, space=space
-        )
+        drawn: Any = {"space": space, "draws": asked_for.get("draws")}
+        self.world.reset(seed=seed, episode=0 if number is None else number, do=request, **drawn)
         if request:
             self._note()
         now = self._look()

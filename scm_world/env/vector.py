@@ -242,6 +242,12 @@ class Vector:
             given[KEYPOINTS] = self._view[2](values)
         return self._of(np.concatenate([np.ravel(given[name]) for name in self.layout]))
 
+    def numbers(self, observation: ArrayLike) -> Floats:
+        """Return what the first numbers of an observation show, in SI units, shape (n,)."""
+        _, _, gain, offset, shifts, _ = self._scales
+        shown = np.asarray(observation, np.float64)[: gain.size]
+        return np.asarray((shown - offset) / gain - shifts)
+
     def _of(self, raw: Floats) -> NDArray[np.float32]:
         """Observe the numbers themselves, shape (n,)."""
         scales = np.vstack([self._scales[:4], np.zeros(raw.size), np.arange(raw.size)])

@@ -8,6 +8,7 @@ An evaluation is one call::
     found.save("results")
 """
 
+from scm_world.evaluation.adaptive import Adaptive
 from scm_world.evaluation.episodes import METRICS, Hook, in_world, play
 from scm_world.evaluation.explanation import Explanation, Otherwise, why
 from scm_world.evaluation.inference import inferred
@@ -20,6 +21,7 @@ from scm_world.evaluation.verdicts import Change, Inferred, Probe
 
 __all__ = [
     "METRICS",
+    "Adaptive",
     "Causes",
     "Change",
     "Evaluation",

@@ -25,7 +25,7 @@ from scm_world.errors import (
     UnknownVariable,
 )
 from scm_world.evaluation.protocols import Protocol
-from scm_world.policies.agents import Actions, as_agent
+from scm_world.policies.agents import Actions, Agent, as_agent
 from scm_world.policies.cards import FORM
 from scm_world.policies.scripted import Policy
 from scm_world.queries.world import World
@@ -77,6 +77,7 @@ def play(
     *,
     seed: int | None = None,
     episode: int | None = None,
+    draws: int | None = None,
 ) -> dict[str, Any]:
     """Run an episode of an environment with an agent; return the info of its end.
 
@@ -87,6 +88,7 @@ def play(
         hooks: They follow the episode in this order.
         seed: Seed of the noise; the present noise if None.
         episode: Number of the episode within the noise; the next one if None.
+        draws: Number of the episode whose draws hold; its own if None. See ``World.reset``.
 
     Example:
         >>> env = gymnasium.make("scm_world/Pushing-v0", backend="fake", max_episode_length=3)
@@ -97,7 +99,8 @@ def play(
     if not (hasattr(agent, "start") and hasattr(agent, "act")):
         raise UnknownOption("agent", agent, ("as_agent(policy)", "an object with start and act"))
     given: dict[str, Any] = {} if plan is None else {"do": plan}
-    given |= {} if episode is None else {"episode": episode}
+    numbers = {"episode": episode, "draws": draws}
+    given |= {name: number for name, number in numbers.items() if number is not None}
     observation, info = env.reset(seed=seed, options=given)
     inner = unwrapped_env(env, "play")
     agent.start(inner)
@@ -124,6 +127,9 @@ KEYS = ("agent", "run", "engine", "protocol", "seed", "episode")
 DRAWN = "drawn "
 """First word of the columns with the values that were drawn."""
 
+REWARDS = "rewards"
+"""Entry of a row with the reward of each control step, if these are kept."""
+
 Row = dict[str, Any]
 """An episode in the table of an evaluation, by column: ``KEYS``, ``steps``, those of ``METRICS``
 that the task has, ``hash``, and each number of each variable that was drawn."""
@@ -146,6 +152,7 @@ class ScoreHook(Hook):
         """Begin to measure."""
         self._env, self.digest, self._version = env, blake2b(digest_size=16), -1
         self._fractions: list[float] = []
+        self.rewards: list[float] = []
         self._total, self.steps = 0.0, 0
         self.drawn = self._values(0)
         self._look()
@@ -159,6 +166,7 @@ class ScoreHook(Hook):
     def after(self, observation: Observation, reward: float, info: Mapping[str, Any]) -> bool:
         """Measure a control step."""
         self._total += reward
+        self.rewards.append(reward)
         self.steps += 1
         if info.get(FRACTION) is not None:
             self._fractions.append(info[FRACTION])
@@ -251,23 +259,31 @@ def scored_episode(
     episode: int,
     who: tuple[str, int] = ("", 0),
     hooks: Sequence[Hook] = (),
+    steps: bool = False,
 ) -> Row:
-    """Run an episode under a protocol, and return its row.
+    """Run an episode under a protocol, and return its row, also with ``REWARDS`` if asked.
 
-    ``who`` is the agent's name and the number of its run.
+    ``who`` is the agent's name and the number of its run. An agent that remembers forgets before
+    the first episode of each draw.
     """
     measured, engine = ScoreHook(), env.world.engine_name
     place = dict(zip(KEYS, (*who, engine, protocol.name, seed, episode), strict=True))
     with placed(place, env):
         acting = under(env, protocol)
-        play(acting, agent, hooks=(*hooks, measured), seed=seed, episode=episode)
+        draw, attempt = divmod(episode, protocol.repeats)
+        if not attempt and isinstance(agent, Agent):
+            agent.forget()
+        draws = draw if protocol.repeats > 1 else None
+        every = (*hooks, measured)
+        play(acting, agent, hooks=every, seed=seed, episode=episode, draws=draws)
     drawn = {
         f"{DRAWN}{name}" + (f"[{k}]" if len(values) > 1 else ""): value
         for name, values in measured.drawn.items()
         for k, value in enumerate(values)
     }
-    steps, digest = measured.steps, measured.digest.hexdigest()
-    return {**place, "steps": steps, **measured.scores(), "hash": digest, **drawn}
+    row = {**place, "steps": measured.steps, **measured.scores()}
+    row |= {REWARDS: measured.rewards} if steps else {}
+    return {**row, "hash": measured.digest.hexdigest(), **drawn}
 
 
 def under(env: ScmWorldEnv, protocol: Protocol) -> CurriculumEnv:

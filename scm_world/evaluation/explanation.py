@@ -192,6 +192,10 @@ def why(
     one_of("versus", versus, (None, *VERSUS))
     setup = again(evaluation.only(agent=agent, engine=engine), policy, task, trusted)
     actor, done_there = setup.agents[agent, run], setup.protocols[protocol]
+    draw, attempt = divmod(episode, done_there.repeats)
+    if attempt and actor.keeps:
+        allowed = (f"{episode - attempt}, the first of its draw: {agent!r} remembers the others",)
+        raise UnknownOption("episode", episode, allowed)
     where: dict[str, Any] = {"seed": seed, "episode": episode, "who": (agent, run)}
     found, left_out = [], {}
     with closing(setup.env(engine, actor)) as env:
@@ -205,7 +209,8 @@ def why(
         if not drawn:
             allowed = ("an episode in which something is drawn",)
             raise UnknownOption("episode", f"{protocol}, {episode}", allowed)
-        env.reset(seed=seed, options={"episode": episode})
+        same = {"draws": draw} if done_there.repeats > 1 else {}
+        env.reset(seed=seed, options={"episode": episode, **same})
         world = env.world
         here = world.values()  # without interventions of the protocol
         against = {name: versus or _versus(world, here, name, drawn) for name in drawn}
@@ -221,7 +226,8 @@ def why(
             part = _instead(done_there.curriculum(), name, how, is_set, usual)
             look = _Look(name, done_there.step)
             try:
-                instead = Protocol(f"{protocol} without {name}", act=part)
+                about = {"act": part, "repeats": done_there.repeats}
+                instead = Protocol(f"{protocol} without {name}", **about)
                 then = scored_episode(env, actor, instead, hooks=(look,), **where)
             except EvaluationError as error:
                 left_out[name] = error.reason

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import closing
@@ -12,9 +13,9 @@ import pandas
 
 from scm_world._arguments import typed
 from scm_world.env import ScmWorldEnv
-from scm_world.evaluation.episodes import Row, scored_episode
+from scm_world.evaluation.episodes import REWARDS, Row, scored_episode
 from scm_world.evaluation.preparation import prepare
-from scm_world.evaluation.results import Evaluation
+from scm_world.evaluation.results import Evaluation, padded
 from scm_world.evaluation.setups import Setup, Shard, form_of
 from scm_world.queries.progress import Progress
 from scm_world.runs.files import Location
@@ -39,8 +40,9 @@ class ShardRunner:
         if key not in self.environments:
             self.environments[key] = self.setup.env(shard.engine, agent)
         env = self.environments[key]
+        how: dict[str, Any] = {"seed": shard.seed, "who": who, "steps": self.setup.steps}
         return [
-            scored_episode(env, agent, protocol, seed=shard.seed, episode=episode, who=who)
+            scored_episode(env, agent, protocol, episode=episode, **how)
             for episode in range(shard.first, shard.stop)
         ]
 
@@ -66,6 +68,8 @@ def evaluate(
     out: Location | str | None = None,
     trusted: Sequence[str] | None = None,
     progress: Progress | None = None,
+    repeats: int | None = None,
+    steps: bool = False,
 ) -> Evaluation:
     """Find out how well policies do in protocols.
 
@@ -94,6 +98,9 @@ def evaluate(
             interruption, and adds policies, protocols, engines or episodes to it.
         trusted: Packages whose functions may be named as policies; any if None.
         progress: Called with how many episodes are done, and how many there are.
+        repeats: For how many episodes in a row each draw of each protocol holds, for agents that
+            remember; that of each protocol if None. ``n`` is a multiple of it.
+        steps: Whether the reward of each control step is kept, for ``Evaluation.since``.
 
     Returns:
         The table of all episodes, with its estimates.
@@ -111,8 +118,9 @@ def evaluate(
         >>> len(found), found.protocols
         (4, ('P0', 'P5'))
     """
-    setup = prepare(policy, protocols, task, n, seeds, backend, env, trusted)
-    cells = {f"parts/{setup.key(shard)}.json": shard for shard in setup.shards()}
+    setup = prepare(policy, protocols, task, n, seeds, backend, env, trusted, repeats, steps)
+    kind, read, write = (".parquet", _unpacked, _packed) if steps else (".json", _read, _written)
+    cells = {f"parts/{setup.key(shard)}{kind}": shard for shard in setup.shards()}
     planned = sum(shard.stop - shard.first for shard in cells.values())
     tell = progress or (lambda *_: None)
     found: dict[str, list[Row]] = {}
@@ -124,17 +132,31 @@ def evaluate(
             pool.check(f"policy {name!r} with several workers", agent.policy)
         with Study(out, "evaluation", {}) as study, closing(ShardRunner(setup)) as runner:
             tell(0, planned)
-            for name, played in study.map(
-                cells,
-                runner,
-                read=lambda data: [{**row, "hash": str(row["hash"])} for row in json.loads(data)],
-                write=lambda rows: (json.dumps(rows) + "\n").encode(),
-                pool=pool,
-            ):
+            for name, played in study.map(cells, runner, read=read, write=write, pool=pool):
                 found[name] = played
                 done += len(played)
                 tell(done, planned)
     frame = pandas.DataFrame([row for name in cells for row in found[name]])
     policies = {who: agent.policy for who, agent in setup.agents.items()}
     made = None if isinstance(setup.task, str) else setup.task
-    return Evaluation(setup.about(), frame, policies, made)
+    rewards = padded(frame.pop(REWARDS)) if steps else None
+    return Evaluation(setup.about(), frame, policies, made, rewards)
+
+
+def _read(data: bytes) -> list[Row]:
+    return [{**row, "hash": str(row["hash"])} for row in json.loads(data)]
+
+
+def _written(rows: list[Row]) -> bytes:
+    return (json.dumps(rows) + "\n").encode()
+
+
+def _unpacked(data: bytes) -> list[Row]:
+    found: Any = pandas.read_parquet(io.BytesIO(data)).to_dict("records")
+    return list[Row](found)
+
+
+def _packed(rows: list[Row]) -> bytes:
+    content = io.BytesIO()
+    pandas.DataFrame(rows).to_parquet(content, compression="zstd", index=False)
+    return content.getvalue()

@@ -13,7 +13,7 @@ from typing import Any
 
 import gymnasium
 
-from scm_world._arguments import one_of, whole_number
+from scm_world._arguments import one_of, true_or_false, whole_number
 from scm_world._fingerprint import differing, fingerprint
 from scm_world.backends import require_backend
 from scm_world.env import ENV_OPTIONS
@@ -29,7 +29,7 @@ from scm_world.evaluation.protocols import Protocol, chosen, named, protocols_of
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.setups import Setup, several
 from scm_world.policies.agents import Agent, agent_from, as_agent
-from scm_world.policies.cards import COMMON, FORM, FREE, as_json, contradiction, usual
+from scm_world.policies.cards import ANY, COMMON, FORM, FREE, as_json, contradiction, usual
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import FORMAT, Plan
 from scm_world.tasks import AnySource, Task, make_task, tasks
@@ -55,6 +55,8 @@ def prepare(
     backend: object,
     env: Mapping[str, Any] | None,
     trusted: Sequence[str] | None,
+    repeats: int | None = None,
+    steps: bool = False,
 ) -> Setup:
     """Check everything that can be checked before the first episode.
 
@@ -69,7 +71,8 @@ def prepare(
             gymnasium.logger.warn(
                 f"{name!r} does not say how it observes and acts; it acts here with the "
                 "defaults of gymnasium.make, and recipes train with other actions: give "
-                "env={'action_mode': …} as in its training, or a file that export_sb3 has written"
+                "as_agent(…, env={'action_mode': …}) as in its training, or a file that export_sb3 "
+                "has written"
             )
     task = task_for(_made(task), agents, trusted or ())
     for name in env or {}:
@@ -87,6 +90,13 @@ def prepare(
     count = whole_number("n", n, least=1)
     place = Setup(task, shared_options(env, agents), agents, engines, {}, noises, count)
     wanted = {one.name: one for one in chosen(protocols, protocols_of(place.made, engines[0]))}
+    if repeats is not None:
+        same = {"repeats": whole_number("repeats", repeats, least=1)}
+        wanted = {name: one.model_copy(update=same) for name, one in wanted.items()}
+    for one in wanted.values():
+        if count % one.repeats:
+            multiple = f"a multiple of {one.repeats}, the repeats of each draw of {one.name}"
+            raise UnknownOption("n", count, (multiple,))
     found: dict[str, dict[str, str]] = {}
     silent: dict[str, tuple[str, ...]] = {}
     for engine in engines:
@@ -100,6 +110,7 @@ def prepare(
                 own = shared if agent.card is None else place.env(engine, agent)
                 try:
                     observation, _ = own.reset(seed=0)
+                    agent.forget()
                     agent.start(own)
                     agent.act(observation)
                     if "sha256" not in agent.about and agent.about.get("kind") != "named":
@@ -110,7 +121,8 @@ def prepare(
                 finally:
                     if own is not shared:
                         own.close()
-    setup = Setup(task, place.options, agents, engines, wanted, noises, count, found, silent)
+    kept = found, silent, true_or_false("steps", steps)
+    setup = Setup(task, place.options, agents, engines, wanted, noises, count, *kept)
     setup.about()  # refuses an environment that cannot be written down, before any episode
     return setup
 
@@ -171,7 +183,8 @@ def task_for(task: Task | str | None, agents: Agents, trusted: Sequence[str] = (
 
     Warn of an agent that was trained for another task than the one that is given.
     """
-    cards = {name: agent.card for (name, _), agent in agents.items() if agent.card is not None}
+    every = {name: agent.card for (name, _), agent in agents.items() if agent.card is not None}
+    cards = {name: card for name, card in every.items() if card.task != ANY}
     if task is not None:
         given = task if isinstance(task, str) else task.name
         for name, card in cards.items():
@@ -205,13 +218,14 @@ def shared_options(given: Mapping[str, Any] | None, agents: Agents) -> dict[str,
     if all_say:
         found = {option: value for option, value in found.items() if option not in FORM}
     for option in (name for name in (*COMMON, *FREE) if name not in found):
-        options = [card.option(option) for _, card in trained]
+        say = [(n, card) for n, card in trained if card.task != ANY or option in card.env]
+        options = [card.option(option) for _, card in say]
         if any(one != options[0] for one in options):
-            each = "; ".join(f"{name} with {card.option(option)!r}" for name, card in trained)
+            each = "; ".join(f"{name} with {card.option(option)!r}" for name, card in say)
             allowed = f"the same for all agents, and they were trained {each}: "
             allowed += "evaluate them apart" if option in COMMON else f"give {option} in env"
             raise UnknownOption(option, "several values", (allowed,))
-        if options and options[0] != usual(option, trained[0][1].task):
+        if options and options[0] != usual(option, say[0][1].task):
             found[option] = options[0]
     return found
 
@@ -285,9 +299,9 @@ def _acted(
         if who in given:
             yield who, as_agent(given[who])
         elif who in evaluation.policies and "path" not in what:
-            yield who, as_agent(evaluation.policies[who])
+            yield who, as_agent(evaluation.policies[who], env=one.get("env"))
         else:
-            yield who, agent_from(what, trusted=trusted)
+            yield who, agent_from(what, trusted=trusted, env=one.get("env"))
 
 
 def _acts(options: object, trusted: Sequence[str]) -> Any:

@@ -41,6 +41,8 @@ class Protocol(Frozen):
         space: Where they are drawn from.
         step: The control step at which that is done; 0 is the reset.
         act: A part of a curriculum, instead of ``varies`` and ``space``.
+        repeats: For how many episodes in a row a draw holds; see ``World.reset(draws=…)``. Episode
+            i has draw ``i // repeats``. An agent may remember the earlier ones, see ``Agent``.
         doc: In a few words.
 
     Example:
@@ -56,6 +58,7 @@ class Protocol(Frozen):
     space: SpaceName | Subset | Distribution = "A"
     step: int = 0
     act: AnyPart | None = None
+    repeats: int = 1
     doc: str = ""
 
     def __init__(
@@ -73,7 +76,9 @@ class Protocol(Frozen):
         if act is not None and several:
             raise UnknownOption(f"varies of protocol {name}", varies, ("nothing, beside act",))
         step = whole_number("step", fields.pop("step", 0), least=0)
+        repeats = whole_number("repeats", fields.pop("repeats", 1), least=1)
         given: dict[str, Any] = {"name": name, "varies": several, "space": space, "step": step}
+        given["repeats"] = repeats
         if act is not None:
             given["act"] = as_curriculum(act)
         super().__init__(**given, **fields)
@@ -97,7 +102,8 @@ class Protocol(Frozen):
             ModelError: It calls a function that cannot be found again under its name.
         """
         self.curriculum().as_dict()  # it checks the functions
-        return {"format": FORMAT, **self.model_dump(mode="json")}
+        once = {"repeats"} if self.repeats == 1 else None
+        return {"format": FORMAT, **self.model_dump(mode="json", exclude=once)}
 
     @classmethod
     def from_dict(cls, data: object, *, trusted: Sequence[str] = ()) -> Protocol:

@@ -61,7 +61,7 @@ TEACHER = "teacher"
 
 _STEPS = {"reward": "rewards", "terminated": "terminations", "truncated": "truncations"}
 
-_UNUSED: Mapping[str, Any] = dict.fromkeys(
+UNUSED: Mapping[str, Any] = dict.fromkeys(
     ("start", "random_goal", "variables_space", "render_mode", "render_camera", "render_size")
 )
 """Arguments of an environment that repeats recorded interventions, and makes none itself."""
@@ -236,7 +236,7 @@ class Recording:
         """
         if task is None:
             refuse_untrusted(_name(self.environment), self.trusted)
-        arguments = {**self.environment, **_UNUSED}
+        arguments = {**self.environment, **UNUSED}
         unknown = arguments.keys() - {*ENV_OPTIONS}
         if unknown:
             raise SnapshotMismatch(

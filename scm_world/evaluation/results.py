@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, final
 
 import numpy as np
 import pandas
 
-from scm_world._arguments import one_of, typed
+from scm_world._arguments import one_of, typed, whole_number
 from scm_world._types import Floats
 from scm_world.env.observer import FAILED
 from scm_world.errors import UnknownOption, reading
-from scm_world.evaluation.episodes import FRACTIONS, KEYS, METRICS, drawn_columns
+from scm_world.evaluation.episodes import FRACTIONS, KEYS, METRICS, REWARDS, drawn_columns
 from scm_world.evaluation.statistics import (
     Causes,
     Interval,
     aggregate,
+    crossed_interval,
     difference_interval,
     find_causes,
     mean_interval,
@@ -46,6 +48,7 @@ RATES: Mapping[str, bool | None] = {
 FORMAT = "scm_world/evaluation/3"
 RESULTS = "results.json"
 TABLE = "episodes.parquet"
+STEPS = "steps.parquet"
 ABOUT = ("task", "arguments", "env", "engines", "agents", "protocols", "seeds", "n", "versions")
 ADVICE = "give the folder, or the results.json, that an evaluation wrote"
 NO_PATH = "no directed path leads from it to the score or the observation"
@@ -63,6 +66,14 @@ def settled(found: Interval, *frames: pandas.DataFrame) -> Interval:
     return replace(found, low=found.value, high=found.value) if all(same) else found
 
 
+def padded(rows: pandas.Series[Any]) -> Floats:
+    """Return the rewards of episodes as an array, shape (n, steps); NaN after an episode's end."""
+    found = np.full((len(rows), max(map(len, rows))), np.nan)
+    for row, rewards in zip(found, rows, strict=True):
+        row[: len(rewards)] = rewards
+    return found
+
+
 @final
 @dataclass(frozen=True, eq=False)
 class Evaluation:
@@ -75,12 +86,15 @@ class Evaluation:
             (NaN where a variable was not).
         policies: The policies, by agent and run, if they were given in this process; in no file.
         made: The task, if it was given as an object in this process; in no file.
+        rewards: The reward of each control step, if asked for by ``steps=True``, shape (n, steps)
+            in the order of the rows of ``frame``; NaN after an episode's end.
     """
 
     about: Mapping[str, Any]
     frame: pandas.DataFrame
     policies: Mapping[tuple[str, int], Any] = field(default_factory=dict, repr=False)
     made: Task | None = field(default=None, repr=False)
+    rewards: Floats | None = field(default=None, repr=False)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the policies and the task: not all of them can be pickled."""
@@ -150,14 +164,38 @@ class Evaluation:
         Raises:
             UnknownOption: There are no episodes.
         """
-        frame = self.frame
+        kept = np.full(len(self), True)
         for name, value in wanted.items():
             one_of("column", name, KEYS)
             if value is not None:
                 if np.ndim(value) or value not in self._listed(name):
                     raise UnknownOption(name, value, tuple(map(str, self._listed(name))))
-                frame = frame[frame[name] == value]
-        return replace(self, frame=frame.reset_index(drop=True))
+                kept &= (self.frame[name] == value).to_numpy()
+        rewards = None if self.rewards is None else self.rewards[kept]
+        return replace(self, frame=self.frame[kept].reset_index(drop=True), rewards=rewards)
+
+    @cached_property
+    def by_draw(self) -> Evaluation:
+        """The evaluation with a row for each draw, with the means of the episodes that repeat it.
+
+        Its column ``episode`` has the number of the draw. Estimates are over draws, since episodes
+        of one draw depend on one another.
+        """
+        about = {one["name"]: dict(one) for one in self.about.get("protocols", ())}
+        times = {name: one.pop("repeats", 1) for name, one in about.items()}
+        each = self.frame["protocol"].map(times).fillna(1).astype(int)
+        if (each == 1).all():
+            return self
+        means = dict.fromkeys(("steps", *self.metrics), "mean")
+        how: dict[str, Any] = {
+            name: means.get(name, "".join if name == "hash" else "first")
+            for name in map(str, self.frame)
+            if name not in KEYS
+        }
+        frame = self.frame.assign(episode=self.frame["episode"] // each)
+        frame = frame.groupby([*KEYS], sort=False, as_index=False).agg(how)
+        return replace(self, about={**self.about, "protocols": [*about.values()]}, frame=frame,
+                       rewards=None)  # fmt: skip
 
     def the(self, name: str, given: str | None) -> str:
         """Choose an agent or a backend; where there is only one it need not be named.
@@ -182,7 +220,7 @@ class Evaluation:
 
         Returns:
             Shape ``(runs, protocols, episodes)``, of the protocols that it has played; episodes
-            in the order of seed and number.
+            in the order of seed and number, of a draw that is repeated their mean.
 
         Raises:
             UnknownOption: Metric, agent or backend is unknown, or protocols do not have the same
@@ -190,7 +228,8 @@ class Evaluation:
         """
         metric = self.metric(metric)
         agent, engine = self.the("agent", agent), self.the("engine", engine)
-        mine = self.only(agent=agent, engine=engine).frame.sort_values(["seed", "episode"])
+        mine = self.by_draw.only(agent=agent, engine=engine).frame
+        mine = mine.sort_values(["seed", "episode"])
         played = [one for one in self.protocols if (mine["protocol"] == one).any()]
         groups = dict(iter(mine.groupby(["run", "protocol"])[metric]))
         runs = mine["run"].unique()
@@ -220,7 +259,7 @@ class Evaluation:
         """
         metric = self.metric(metric)
         agent, engine = self.the("agent", agent), self.the("engine", engine)
-        mine = self.only(agent=agent, engine=engine, protocol=protocol).frame
+        mine = self.by_draw.only(agent=agent, engine=engine, protocol=protocol).frame
         found = mean_interval(means(mine, metric).to_numpy(), proportion=RATES[metric])
         return settled(found, mine)
 
@@ -251,7 +290,7 @@ class Evaluation:
         Raises:
             UnknownOption: Agent or backend is unknown, or they have not played the same episodes.
         """
-        metric, here = self.metric(metric), self.only(protocol=protocol)
+        metric, here = self.metric(metric), self.by_draw.only(protocol=protocol)
         if one in self.engines:
             name, here = "engine", here.only(agent=self.the("agent", agent))
         else:
@@ -277,6 +316,148 @@ class Evaluation:
         metric = self.metric(metric)
         scores = self.scores(metric, agent=agent, engine=engine)
         return aggregate(scores, over="runs" if len(scores) > 1 else "episodes")
+
+    # --- adaptation ---------------------------------------------------------------------------
+
+    def _tables(
+        self, agents: Sequence[str], protocol: str, metric: str, engine: str | None
+    ) -> tuple[list[pandas.DataFrame], list[pandas.DataFrame]]:
+        """Return the scores of each agent by draw and run, of the same draws, and its rows."""
+        here = self.by_draw.only(protocol=protocol, engine=self.the("engine", engine))
+        rows = [here.only(agent=agent).frame for agent in agents]
+        tables = [f.pivot(index=["seed", "episode"], columns="run", values=metric) for f in rows]
+        if any(
+            one.isna().any(axis=None) or not one.index.equals(tables[0].index) for one in tables
+        ):
+            raise UnknownOption("draws", "others", ("those that every run of both has played",))
+        return tables, rows
+
+    @typed
+    def regret(
+        self,
+        agent: str,
+        reference: str,
+        protocol: str,
+        metric: str | None = None,
+        *,
+        engine: str | None = None,
+    ) -> Interval:
+        """Estimate by how much the scores of a reference agent are higher, paired by draw.
+
+        A reference that is told what the agent has to find out says what there is to be gained.
+        The interval is over draws and over the training runs of both, see ``crossed_interval``;
+        ``difference`` has one over episodes of these runs.
+
+        Raises:
+            UnknownOption: Agent, protocol, metric or backend is unknown, or they have not played
+                the same draws.
+        """
+        metric = self.metric(metric)
+        (mine, best), rows = self._tables((agent, reference), protocol, metric, engine)
+        lost = best.to_numpy().T[:, None] - mine.to_numpy().T[None]  # (runs, runs, draws)
+        return settled(crossed_interval(lost, bounds=(-1.0, 1.0) if RATES[metric] else None), *rows)
+
+    @typed
+    def probability_of_improvement(
+        self,
+        one: str,
+        other: str,
+        protocol: str,
+        metric: str | None = None,
+        *,
+        engine: str | None = None,
+    ) -> Interval:
+        """Estimate the probability that a run of one scores higher than one of another agent.
+
+        It is the share of pairs of their training runs, in the same draw, that the first one wins,
+        with half of the ties. Intervals and errors are those of ``regret``.
+
+        Source:
+            Agarwal et al., *Deep reinforcement learning at the edge of the statistical precipice*,
+            NeurIPS 2021; Mann and Whitney, Annals of Mathematical Statistics 1947.
+        """
+        (first, second), rows = self._tables((one, other), protocol, self.metric(metric), engine)
+        apart = first.to_numpy().T[:, None] - second.to_numpy().T[None]
+        found = crossed_interval(0.5 + 0.5 * np.sign(apart), bounds=(0.0, 1.0))
+        return settled(found, *rows)
+
+    @typed
+    def attempts(
+        self,
+        protocol: str,
+        metric: str | None = None,
+        *,
+        agent: str | None = None,
+        engine: str | None = None,
+    ) -> tuple[Interval, ...]:
+        """Estimate the mean score of the first, second, … episode of each draw, then last - first.
+
+        The last estimate is by how much the last episode of a draw scores higher than the first
+        one, paired: what an agent that remembers has learned. Intervals are over draws and
+        training runs, see ``crossed_interval``.
+
+        Raises:
+            UnknownOption: The protocol repeats no draw, or a name is unknown.
+        """
+        metric, about = self.metric(metric), self.about.get("protocols", ())
+        times = {one["name"]: one.get("repeats", 1) for one in about}.get(protocol, 1)
+        agent, engine = self.the("agent", agent), self.the("engine", engine)
+        frame = self.only(agent=agent, engine=engine, protocol=protocol).frame
+        if times < 2:
+            raise UnknownOption("protocol", protocol, ("one with repeats=2 or more",))
+        table = frame.pivot(index="run", columns=["seed", "episode"], values=metric).sort_index(
+            axis=1
+        )
+        scores = table.to_numpy().reshape(len(table), -1, times)  # (runs, draws, attempts)
+        one, apart = ((0.0, 1.0), (-1.0, 1.0)) if RATES[metric] else (None, None)
+        each = [crossed_interval(scores[..., k], bounds=one) for k in range(times)]
+        return (*each, crossed_interval(scores[..., -1] - scores[..., 0], bounds=apart))
+
+    @typed
+    def since(
+        self,
+        protocol: str,
+        *,
+        agent: str | None = None,
+        engine: str | None = None,
+        every: int = 1,
+    ) -> pandas.DataFrame:
+        """Estimate the mean reward by control step since the intervention of a protocol.
+
+        Args:
+            protocol: Name of the protocol, such as ``"P2@100"``.
+            agent: Name of the agent; not needed where there is one.
+            engine: Name of the backend; not needed where there is one.
+            every: Control steps that one row is the mean of.
+
+        Returns:
+            A row for each ``every`` control steps: ``step``, counted from the intervention, so that
+            those before it are negative; the mean ``reward`` of a control step from there on; and
+            ``low`` and ``high`` of the interval over draws and training runs, see
+            ``crossed_interval``. After its end an episode earns nothing.
+
+        Raises:
+            UnknownOption: The evaluation kept no rewards, or a name is unknown.
+        """
+        size = whole_number("every", every, least=1)
+        if self.rewards is None:
+            raise UnknownOption("since", "without rewards", ("an evaluation with steps=True",))
+        agent, engine = self.the("agent", agent), self.the("engine", engine)
+        mine = self.only(agent=agent, engine=engine, protocol=protocol)
+        about = {one["name"]: one for one in self.about["protocols"]}[protocol]
+        at, times = about["step"], about.get("repeats", 1)
+        order = mine.frame.sort_values(["run", "seed", "episode"]).index
+        values = np.nan_to_num(mine.rewards[order])  # type: ignore[index] # it has some
+        values = values.reshape(mine.frame["run"].nunique(), -1, times, values.shape[1]).mean(
+            axis=2
+        )
+        first = -(at // size) * size
+        rows = []
+        for begin in range(first, values.shape[2] - at, size):
+            places = slice(max(at + begin, 0), at + begin + size)
+            found = crossed_interval(values[:, :, places].mean(axis=2))
+            rows.append((begin, found.value, found.low, found.high))
+        return pandas.DataFrame(rows, columns=["step", "reward", "low", "high"])
 
     def drawn(self) -> dict[str, Floats]:
         """Return the values that were drawn in all rows, by variable, shape ``(n, numbers)``."""
@@ -306,7 +487,7 @@ class Evaluation:
         """
         metric = self.metric(metric)
         agent, engine = self.the("agent", agent), self.the("engine", engine)
-        mine = self.only(agent=agent, engine=engine, protocol=protocol)
+        mine = self.by_draw.only(agent=agent, engine=engine, protocol=protocol)
         first = mine.only(run=mine._listed("run")[0])
         units = pandas.MultiIndex.from_frame(first.frame[["seed", "episode"]])
         scores = means(mine.frame, metric).loc[units].to_numpy()
@@ -320,14 +501,16 @@ class Evaluation:
 
     # --- files --------------------------------------------------------------------------------
 
-    def save(self, folder: Location | str) -> tuple[Location, Location]:
+    def save(self, folder: Location | str) -> tuple[Location, ...]:
         """Write ``results.json`` and the table beside it, ``episodes.parquet``.
+
+        If rewards were kept, ``steps.parquet`` has them as lists, with the same rows.
 
         Raises:
             UnwritableFolder: The disk is full, or permission is missing.
         """
-        place, content = located(folder), io.BytesIO()
-        summary, table = place / RESULTS, place / TABLE
+        place, content, more = located(folder), io.BytesIO(), io.BytesIO()
+        summary, table, steps = place / RESULTS, place / TABLE, place / STEPS
         self.frame.to_parquet(content, compression="zstd", index=False)
         data = {
             "format": FORMAT,
@@ -336,9 +519,16 @@ class Evaluation:
             "about": dict(self.about),
         }
         remove(summary)  # it is of the table that goes
+        remove(steps)
         write_whole(table, content.getvalue())
+        if self.rewards is not None:
+            data["steps"] = True
+            kept = zip(self.rewards, self.frame["steps"], strict=True)
+            lists = self.frame[[*KEYS]].assign(**{REWARDS: [row[:n] for row, n in kept]})
+            lists.to_parquet(more, compression="zstd", index=False)
+            write_whole(steps, more.getvalue())
         write_whole(summary, json.dumps(data, indent=1, allow_nan=False) + "\n")
-        return summary, table
+        return (summary, table) if self.rewards is None else (summary, table, steps)
 
     def _summarized(self) -> list[dict[str, Any]]:
         """List the scores with their intervals: one row for each agent, backend and protocol."""
@@ -374,4 +564,10 @@ class Evaluation:
             if missing or len(frame) != data["rows"]:
                 lacks = f"lacks {missing[0]!r}" if missing else "has another number of rows"
                 raise ValueError(f"it, or {TABLE}, {lacks}")
-        return cls(data["about"], frame)
+            rewards = None
+            if data.get("steps"):
+                lists = pandas.read_parquet(io.BytesIO(read_bytes(file.parent / STEPS)))
+                rewards = padded(lists[REWARDS])
+                if len(rewards) != len(frame):
+                    raise ValueError(f"{STEPS} has another number of rows")
+        return cls(data["about"], frame, rewards=rewards)

@@ -54,6 +54,7 @@ class Setup:
         versions: Versions of everything that decides the results, by backend.
         unrelated: By agent, the variables from which no directed path leads to the score or to what
             it observes; of agents that may read the whole world nothing is known.
+        steps: Whether the reward of each control step is kept.
     """
 
     task: Task | str
@@ -65,6 +66,7 @@ class Setup:
     n: int
     versions: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     unrelated: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    steps: bool = False
 
     @cached_property
     def made(self) -> Task:
@@ -85,12 +87,16 @@ class Setup:
         return ScmWorldEnv(self.task, backend=engine, **options)
 
     def shards(self) -> list[Shard]:
-        """List everything that has to be played; compared episodes are near one another."""
+        """List everything that has to be played; compared episodes are near one another.
+
+        Episodes of one draw are played one after another.
+        """
+        sizes = {p.name: max(SHARD // p.repeats, 1) * p.repeats for p in self.protocols.values()}
         return [
-            Shard(*who, engine, protocol, seed, first, min(first + SHARD, self.n))
-            for protocol in self.protocols
+            Shard(*who, engine, protocol, seed, first, min(first + size, self.n))
+            for protocol, size in sizes.items()
             for seed in self.seeds
-            for first in range(0, self.n, SHARD)
+            for first in range(0, self.n, size)
             for engine in self.engines
             for who in self.agents
         ]

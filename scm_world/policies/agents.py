@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import chain, repeat
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, cast, final
 
 import numpy as np
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from scm_world._arguments import load, typed
 from scm_world._types import ArrayLike, Floats, Observation
 from scm_world.errors import ActionError, ModelError, UnknownOption, UnreadableFile, blamed
-from scm_world.policies.cards import PolicyAbout, PolicyEnv
+from scm_world.policies.cards import ANY, PolicyAbout, PolicyEnv, contradiction
 from scm_world.policies.networks import MlpPolicy, load_policy, load_sb2
 from scm_world.policies.scripted import NAMED, OpenLoopPolicy, Policy, Sequence
 from scm_world.policies.wrappers import LinearMap, seen_through
@@ -59,6 +60,7 @@ FORMS = (
     "a function of the observation, such as one that runs an ONNX network",
     "a WorldPolicy",
     "an object with the method predict",
+    "an object with the methods start and act",
     "an array of actions, such as those of an episode",
     "a file (.safetensors, .zip of Stable-Baselines 2 or 3)",
     "the folder of a training run",
@@ -99,6 +101,10 @@ class WorldPolicy:
 @final
 class Agent:
     """Acts in an environment, episode after episode; ``as_agent`` makes it.
+
+    What it learns in an episode is gone in the next one, unless its policy has a method ``forget``:
+    then the policy may remember until that is called, which an evaluation does before the first
+    episode of each draw of a protocol.
 
     Args:
         about: Description of the policy, as plain data.
@@ -141,6 +147,17 @@ class Agent:
         """
         with blamed(f"the policy {self.about['name']!r}"):
             self._env, self._act, self._seen = env, self._begin(env), None
+
+    @property
+    def keeps(self) -> bool:
+        """Whether its policy remembers earlier episodes, too, until ``forget`` is called."""
+        return callable(getattr(self.policy, "forget", None))
+
+    def forget(self) -> None:
+        """Forget all episodes; called where the next one has nothing in common with them."""
+        if self.keeps:
+            with blamed(f"the policy {self.about['name']!r}"):
+                cast("Any", self.policy).forget()
 
     def act(self, observation: Observation) -> Actions:
         """Choose an action of the environment, shape (n_actions,).
@@ -236,6 +253,19 @@ def _function(policy: Any, env: PolicyEnv) -> Actor:
     return act
 
 
+def _started(agent: Any, env: PolicyEnv) -> Actor:
+    agent.start(env)
+    act: Actor = agent.act
+    return act
+
+
+def _formed(
+    begin: Callable[[PolicyEnv], Actor], card: PolicyAbout, name: str, env: PolicyEnv
+) -> Actor:
+    card.check(env, name)
+    return begin(env)
+
+
 def _model(model: Any, env: PolicyEnv, seen: LinearMap | None = None) -> Actor:
     """Begin an episode of a model with ``predict``, which observes through wrappers."""
     shapes = [_shapes(getattr(one, "observation_space", None)) for one in (model, env)]
@@ -307,21 +337,30 @@ def _open_loop(actions: Actions, name: str, env: PolicyEnv) -> Actor:
 # --- what a user gives ----------------------------------------------------------------------------
 
 
-def as_agent(policy: object, *, trusted: SequenceOf[str] | None = None) -> Agent:
+def as_agent(
+    policy: object,
+    *,
+    trusted: SequenceOf[str] | None = None,
+    env: Mapping[str, Any] | None = None,
+) -> Agent:
     """Read a policy.
 
     Args:
         policy: A function of the observation; an object with ``predict`` as Stable-Baselines3 has
-            it; the name of a policy of this package; a ``WorldPolicy``; actions, shape (n,) or
-            (steps, n), in the units of the environment; the path of a policy file or of an archive
-            of Stable-Baselines 2; the folder of a training run; an archive of Stable-Baselines3,
-            if ``"stable_baselines3"`` is among ``trusted``;
-            ``"zoo:pushing"``, one that comes with this package; or
+            it, or with ``start`` and ``act`` as an ``Agent`` has them; the name of a policy of this
+            package; a ``WorldPolicy``; actions, shape (n,) or (steps, n), in the units of the
+            environment; the path of a policy file or of an archive of Stable-Baselines 2; the
+            folder of a training run; an archive of Stable-Baselines3, if ``"stable_baselines3"`` is
+            among ``trusted``; ``"zoo:pushing"``, one that comes with this package; or
             ``"package.module:function"``.
         trusted: Packages whose functions may be named. None: any, as the caller named it.
+        env: How it observes and acts, as a policy file says it: options of the environment such as
+            ``{"action_mode": "delta_joint_positions", "context": "observation"}``; the others have
+            their defaults. An evaluation gives it an environment of this form. If None, it takes
+            any, and a model of Stable-Baselines3 that has its environment that one's.
 
     Raises:
-        UnknownOption: It is something else.
+        UnknownOption: It is something else, or says itself that an option is another one.
         ModelError: It names a function that is not there, or of no trusted package.
         UnreadableFile: The file is not a policy, or reading it would run code in it.
         ActionError: Actions have another shape, or are not finite.
@@ -333,23 +372,41 @@ def as_agent(policy: object, *, trusted: SequenceOf[str] | None = None) -> Agent
         ('named', True)
     """
     if isinstance(policy, Agent):
-        return policy
-    if isinstance(policy, str | Path):
-        return _of_text(str(policy), trusted)
-    if isinstance(policy, np.ndarray | list | tuple):
-        return _of_actions(policy)
-    if callable(policy) or hasattr(policy, "predict"):
-        return _of_object(policy, _description(policy))
-    raise UnknownOption("policy", policy, FORMS)
+        found = policy
+    elif isinstance(policy, str | Path):
+        found = _of_text(str(policy), trusted)
+    elif isinstance(policy, np.ndarray | list | tuple):
+        found = _of_actions(policy)
+    elif callable(policy) or hasattr(policy, "predict") or hasattr(policy, "act"):
+        found = _of_object(policy, _description(policy))
+    else:
+        raise UnknownOption("policy", policy, FORMS)
+    if env is None:
+        return found
+    name, known = str(found.about["name"]), found.card
+    card = PolicyAbout.of({"task": ANY if known is None else known.task, "env": env})
+    if known is None:
+        begin = partial(_formed, found._begin, card, name)
+        return Agent(found.about, begin, found.policy, card, remembers=found.remembers)
+    for option, given in card.env.items():
+        if known.option(option) not in (given, None):
+            raise contradiction(option, given, known.option(option), name)
+    return found
 
 
 @typed
-def agent_from(about: Mapping[str, Any], *, trusted: SequenceOf[str] = ()) -> Agent:
+def agent_from(
+    about: Mapping[str, Any],
+    *,
+    trusted: SequenceOf[str] = (),
+    env: Mapping[str, Any] | None = None,
+) -> Agent:
     """Make the agent again that ``Agent.about`` describes.
 
     Args:
         about: Description in a results file.
         trusted: Packages whose functions may be named.
+        env: Its options of the environment, if the file has them.
 
     Raises:
         UnknownOption: It was an object in memory; it can only be given.
@@ -359,19 +416,20 @@ def agent_from(about: Mapping[str, Any], *, trusted: SequenceOf[str] = ()) -> Ag
     kind, name = about.get("kind"), str(about.get("name"))
     advice = "give the policy itself: policy=…"
     if kind == "named" and name in NAMES:
-        return as_agent(name)
+        return as_agent(name, env=env)
     if kind == "function":
         found = _resolved(name, trusted)
-        if about.get("sees") == "world" and not isinstance(found, WorldPolicy):
+        sees = about.get("sees") == "world" and not hasattr(found, "act")
+        if sees and not isinstance(found, WorldPolicy):
             found = WorldPolicy(found)
-        return _of_object(found, {"kind": kind, "name": name, **_library(name)})
+        return as_agent(_of_object(found, {"kind": kind, "name": name, **_library(name)}), env=env)
     if kind not in ("zoo", "file"):
         raise UnknownOption(f"policy to make again from {kind!r}", name, (advice,))
     text = name if kind == "zoo" else str(about["path"])
     path = file_of(text)
     if _sha256(path, advice) != about["sha256"]:
         raise UnreadableFile(str(path), "it is another file than the one that acted", advice)
-    return as_agent(text, trusted=trusted)
+    return as_agent(text, trusted=trusted, env=env)
 
 
 def _of_text(text: str, trusted: SequenceOf[str] | None) -> Agent:
@@ -434,12 +492,16 @@ def _of_actions(actions: ArrayLike) -> Agent:
 
 def _of_object(policy: Any, about: About) -> Agent:
     made = policy() if isinstance(policy, type) else policy
+    policy = made if hasattr(made, "forget") else policy  # the one that remembers
     if isinstance(made, WorldPolicy | OpenLoopPolicy) or made is still:
         inside = made.policy if isinstance(made, WorldPolicy) else made
         begin = partial(_of_world, inside, about["name"])
         return Agent({**about, "sees": "world"}, begin, policy)
     if isinstance(made, MlpPolicy):
         return _of_network(made, {**about, "sha256": made.sha256}, policy)
+    if hasattr(made, "start") and hasattr(made, "act"):
+        how: Any = {"card": getattr(made, "card", None), "remembers": True}
+        return Agent({**about, "sees": "world"}, partial(_started, made), policy, **how)
     if not hasattr(made, "predict"):
         return Agent(about, partial(_function, made), policy, network=made)
     try:
@@ -485,7 +547,8 @@ def _resolved(name: str, trusted: SequenceOf[str] | None) -> Any:
         problem = "is neither a policy of this package nor a function of a trusted one"
         raise ModelError([f"{name!r} {problem}; pass trusted=(…) to use it"])
     try:
-        return function.resolve()
+        found = resolve_name(name)
+        return found if hasattr(found, "act") else function.resolve()
     except (ImportError, AttributeError, ValueError) as error:
         raise ModelError([f"no function is named {name!r}: {error}"]) from None
 

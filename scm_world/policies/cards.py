@@ -51,6 +51,9 @@ COMMON: Mapping[str, JsonValue] = {"frame_skip": None, "conventions": "scm_world
 FREE: Mapping[str, JsonValue] = {"preset": None, "max_episode_length": None}
 """Options of the training that may differ in an evaluation."""
 
+ANY = "any"
+"""The task of a policy that says how it observes and acts, and not for which task."""
+
 USUAL: Mapping[str, JsonValue] = {**FORM, **COMMON, **FREE}
 """Defaults of all these options, which are those of the environment; None is the task's own."""
 
@@ -103,7 +106,7 @@ class PolicyAbout(Frozen):
     Attributes:
         format: Name of the format.
         version: Version of the format.
-        task: Name of the task.
+        task: Name of the task, or ``"any"``.
         env: Options of the environment, those of ``OPTIONS``; the others have their defaults.
         activation: After each hidden layer.
         output: Keeps actions in [-1, 1].

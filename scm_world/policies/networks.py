@@ -42,7 +42,7 @@ from scm_world._arguments import true_or_false, typed, whole_number
 from scm_world._types import ArrayLike, Floats
 from scm_world.errors import ActionError, ModelError, UnknownOption, reading
 from scm_world.geometry.numbers import njit
-from scm_world.policies.cards import HISTORY, KEY, PolicyAbout
+from scm_world.policies.cards import ANY, HISTORY, KEY, PolicyAbout
 from scm_world.runs.files import Location, located, read_arrays, read_bytes, write_whole
 from scm_world.tasks import tasks
 
@@ -53,7 +53,7 @@ Observed = ArrayLike | Mapping[str, ArrayLike]
 NETWORKS = ("layers", "value.layers", "lstm", "value.lstm")
 """Names of the networks in a file."""
 
-_ANY = PolicyAbout(task="any")  # tanh, clip, one array
+_ANY = PolicyAbout(task=ANY)  # tanh, clip, one array
 _SAVED = "give a file that scm_world.policies.save_policy has written"
 _ARCHIVE = "only multilayer perceptrons of PPO2 (MlpPolicy) can be loaded"
 _ENV = (

@@ -107,6 +107,7 @@ class Planned(CausalSystem):
         episode: int = 0,
         do: Mapping[str, Any] | None = None,
         space: AnyRegion | None = None,
+        draws: int | None = None,
     ) -> Audit | None:
         """Begin an episode, with the interventions of ``given``; see ``Simulation.reset``.
 
@@ -114,7 +115,7 @@ class Planned(CausalSystem):
         ``do`` is refused, the episode has begun in its context, without it.
         """
         region, asked = as_region("space", space), request_of(do)
-        super().reset(seed=seed, episode=episode)
+        super().reset(seed=seed, episode=episode, draws=draws)
         self._follow(_Schedule())
         context = do.context if isinstance(do, Plan) else ()
         if not (len(self._given) or context or has_times(asked)):

@@ -28,7 +28,7 @@ from scm_world.models import Difference, Parameters, Scene, Structure
 from scm_world.models.camera import Camera
 from scm_world.tasks import AnySource, Options, Task, make_task
 from scm_world.tasks.composition import Composition, Held, parts
-from scm_world.tasks.model import REWARD
+from scm_world.tasks.model import REWARD, START
 from scm_world.tasks.rewards import FRACTION, SUCCESS
 from scm_world.variables import Draw, Hard, Intervention, Subset
 from scm_world.variables.checks import check_subset
@@ -172,7 +172,7 @@ class Simulation(CausalSystem):
 
     def _have_no_episode(self) -> None:
         self.has_begun, self._lost = False, ""
-        self.noise, self.episode = CompiledNoise(0), 0
+        self.noise, self.episode, self.draws = CompiledNoise(0), 0, None
         self._offset = 0  # steps by which interventions have moved control_index
         self._base: Base | None = None
         self._base_step = -1  # control steps before it was taken
@@ -267,11 +267,15 @@ class Simulation(CausalSystem):
 
     def _draw_nature(self) -> None:
         """Draw the random initial values of this episode."""
-        key = self.noise_key(0)
-        compiled = self.structures.natural(key)
+        key = self.draw_key(0)
+        compiled, starts = self.structures.natural(key), None
         if not compiled.random:
             return
-        row, now = beginning(compiled, key), Base(self.graph, self.row, self.structure)
+        if self.draws is not None:  # start states are those of the episode itself
+            own, places = beginning(compiled, self.noise_key(0)), {*compiled.random}
+            starts = {n: own[n] for s in compiled.slices if (n := f"{s}.{START}") in places}
+        row = beginning(compiled, key, known=starts)
+        now = Base(self.graph, self.row, self.structure)
         changed = now.row.differing(row)
         change = difference(now, row, changed)
         if change is not None:
@@ -288,6 +292,11 @@ class Simulation(CausalSystem):
         Noise depends on the steps taken, not on interventions on ``control_index``.
         """
         return NoiseKey(self.noise, self.episode, index - self._offset, origin=0)
+
+    def draw_key(self, index: int) -> NoiseKey:
+        """Return the noise key with which interventions draw at a control step."""
+        key = self.noise_key(index)
+        return key if self.draws is None else replace(key, episode=self.draws)
 
     # --- the task and the options -------------------------------------------------------------
 
@@ -513,7 +522,7 @@ class Simulation(CausalSystem):
         flat = named(flatten(request, problems), problems)
         before = Base(self.graph, self.row.copy(), self.structure)
         base = self.base or before
-        drawn, key = base.drawn, self.noise_key(self.index)
+        drawn, key = base.drawn, self.draw_key(self.index)
         if any(isinstance(a, Intervention) and (a.is_soft or a.draws) for a in flat.values()):
             initial = base.row.compiled.random if base.at_start else ()
             flat, drawn = renewed(flat, drawn, initial)
@@ -539,7 +548,7 @@ class Simulation(CausalSystem):
     def _go_on(self, one: RowMemory, place: int, row: Rows, origin: Snapshot) -> None:
         """Go on alone from what worlds did together; ``row`` has the present of this one."""
         key = one.key(place)
-        self.noise, self.episode = CompiledNoise(key.noise.seed), key.episode
+        self.noise, self.episode, self.draws = CompiledNoise(key.noise.seed), key.episode, None
         self._origin, self._base_step = origin, key.step
         self._lost, self._offset, self.has_begun, self._checked = "", 0, True, True
         self._hold(row)
@@ -553,7 +562,7 @@ class Simulation(CausalSystem):
 
     def _drawn(self, name: str, act: Any) -> dict[str, tuple[str, Any]]:
         """Draw what an intervention would draw now; return it by target, with the numbers."""
-        model, key = self.model, replace(self.noise_key(self.index), kept=self.last.attempts)
+        model, key = self.model, replace(self.draw_key(self.index), kept=self.last.attempts)
         initial = self.compiled.random if self.base is not None and self.base.at_start else ()
         act = renewed({name: model.accept(name, act)}, {}, initial)[0][name]
         if act.draws:
@@ -695,6 +704,7 @@ class Simulation(CausalSystem):
             offset=self._offset,
             seed=self.noise.seed,
             episode=self.episode,
+            draws=self.draws,
             world=self.identity,
         )
 
@@ -727,7 +737,7 @@ class Simulation(CausalSystem):
         self._adopt(found.model, found.row)
         self.row.numbers[:] = found.row.numbers
         self._lost, self._offset = "", found.offset
-        self.noise, self.episode = noise, found.episode
+        self.noise, self.episode, self.draws = noise, found.episode, found.draws
         self._base, self._base_step = found.base, self.index - self._offset
 
     def close(self) -> None:

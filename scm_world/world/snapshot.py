@@ -85,6 +85,7 @@ class Snapshot:
         offset: Steps by which interventions have moved the clock; noise depends on steps taken.
         seed: Seed of the noise.
         episode: Number of the episode.
+        draws: Number of the episode whose draws hold; None for its own.
         world: Task, options and names of all variables: the identity of the world.
         memory: Data of a subclass.
         content: A snapshot that was pickled, until a world opens it: everything but the index, the
@@ -100,6 +101,7 @@ class Snapshot:
     offset: int = 0
     seed: int = 0
     episode: int = 0
+    draws: int | None = None
     world: tuple[Any, ...] = ()
     memory: Any = None
     content: bytes | None = None

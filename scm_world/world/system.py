@@ -15,7 +15,7 @@ from scm_world._arguments import EPISODES, whole_number
 from scm_world._types import Floats, Value, Values
 from scm_world.backends import EQUATIONS, Backend
 from scm_world.backends.base import ContactPoint
-from scm_world.errors import ModelError, NotReset
+from scm_world.errors import ModelError, NotReset, UnknownOption
 from scm_world.graph import SCM
 from scm_world.graph.scm import request_of
 from scm_world.models import Scene
@@ -39,6 +39,7 @@ class CausalSystem(ABC):
         policies: Scripted policies, by name, beside those of any system.
         noise: The noise of the seed.
         episode: Number of the episode.
+        draws: Number of the episode whose draws hold; None for its own.
         version: Number of changes so far, apart from those by control steps.
         has_begun: Whether an episode has begun.
     """
@@ -48,6 +49,7 @@ class CausalSystem(ABC):
     graph: SCM
     noise: CompiledNoise
     episode: int
+    draws: int | None = None
     version: int = 0
     has_begun = False
     keeps_draws = False
@@ -225,6 +227,7 @@ class CausalSystem(ABC):
         episode: int = 0,
         do: Mapping[str, Any] | None = None,
         space: AnyRegion | None = None,
+        draws: int | None = None,
     ) -> Audit | None:
         """Begin an episode. No intervention of the last episode remains.
 
@@ -235,6 +238,9 @@ class CausalSystem(ABC):
             do: An intervention that takes part in the beginning: a block of another size stands
                 on the floor. It holds until the next reset.
             space: In which every target of it must lie; see ``do``.
+            draws: Number of the episode whose draws hold: what interventions draw, and which
+                parameters nature draws. The start states and all other noise are those of the
+                episode itself. Those of the episode if None.
 
         Returns:
             The audit of the intervention, or None if there was none.
@@ -249,6 +255,9 @@ class CausalSystem(ABC):
             self.noise, self.episode = CompiledNoise(secrets.randbits(63)), 0
         else:
             self.episode = self.episode + 1
+        if draws is not None and self.backend is None:
+            raise UnknownOption("draws", draws, ("None, of equations",))
+        self.draws = None if draws is None else whole_number("draws", draws, least=0)
         self._begin()
         self.requested = {}
         return self.do(request, space=space) if request else None

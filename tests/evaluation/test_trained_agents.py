@@ -12,11 +12,11 @@ import pytest
 from evaluation_samples import SHORT, played_again
 from policy_samples import RELATIVE, policy, trained
 
-from scm_world.errors import EvaluationError, UnknownOption
+from scm_world.errors import EvaluationError, ModelError, UnknownOption
 from scm_world.evaluation import Evaluation, evaluate, why
 from scm_world.evaluation.pipeline import ShardRunner
 from scm_world.evaluation.preparation import prepare, shared_options, task_for
-from scm_world.policies import Agent, PolicyAbout, WorldPolicy
+from scm_world.policies import Agent, PolicyAbout, WorldPolicy, agent_from, as_agent
 
 OTHER = {**RELATIVE, "context": "privileged", "max_episode_length": 16}
 INPUTS = ["context", "observation"]
@@ -193,3 +193,68 @@ def test_a_model_of_another_observation_is_refused_with_both_shapes() -> None:
         evaluate(Model(), "P0", task="pushing", **how)
     found = evaluate(Model(), "P0", task="reaching", **how)
     assert len(found.frame["steps"]) == 1
+
+
+def test_a_policy_in_memory_says_how_it_observes_and_acts(tmp_path: Path) -> None:
+    """It does what the same network in a file does, whose form it has, bit for bit."""
+    network = policy(173)  # with the parameters that it does not observe anyhow
+    form = {**RELATIVE, "context": "observation"}
+
+    def act(observation: Any) -> Any:
+        return network(observation)
+
+    made = as_agent(act, env=form)
+    path = trained(tmp_path / "a.safetensors", 173, env=form)
+    how: dict[str, Any] = {"task": "picking", "env": SHORT}
+    with pytest.warns(UserWarning, match="was trained for the task"):
+        found = small({"memory": made, "file": str(path), "still": "still"}, "P6", **how)
+    hashes = [found.only(agent=name).frame["hash"].tolist() for name in ("memory", "file")]
+    assert hashes[0] == hashes[1]
+    assert found.about["agents"][0]["env"] == form
+    assert why(found.only(agent="memory"), "P6", 1).others
+
+
+def test_a_form_that_does_not_exist_or_contradicts_is_refused() -> None:
+    """Also where the agent acts in an environment that was made by hand."""
+    with pytest.raises(ModelError, match="'contxt' is not one of the options"):
+        as_agent(abs, env={"contxt": "observation"})
+    with pytest.raises(UnknownOption, match="context for 'scm_world"):
+        as_agent(policy(env=RELATIVE), env={"context": "observation"})
+    known = policy(env=RELATIVE)
+    assert as_agent(known, env={"delta_scale": 0.1}).card == known.made_for
+    env = gymnasium.make("scm_world/Pushing-v0", backend="fake").unwrapped
+    env.reset(seed=0)
+    with pytest.raises(UnknownOption, match="context for 'evaluation_samples:linear'"):
+        as_agent("evaluation_samples:linear", env={"context": "observation"}).start(env)
+    about = as_agent("evaluation_samples:linear").about
+    made = agent_from(about, trusted=("evaluation_samples",), env={"delta_scale": 0.5})
+    assert made.card is not None
+    assert made.card.env == {"delta_scale": 0.5}
+
+
+def test_an_object_with_start_and_act_is_an_agent() -> None:
+    """It brings its form as its card, and remembers until it is told to forget."""
+
+    class Mine:
+        card = PolicyAbout(task="any", env=RELATIVE)
+        episodes = 0
+
+        def start(self, env: Any) -> None:
+            self.episodes += 1
+
+        def act(self, observation: Any) -> Any:
+            return np.full(9, 0.1 * self.episodes)
+
+        def forget(self) -> None:
+            self.episodes = 0
+
+    agent = as_agent(Mine())
+    assert agent.keeps
+    assert not as_agent("still").keeps
+    found = small({"mine": agent, "class": Mine, "still": "still"}, "P0", task="pushing")
+    assert found.about["agents"][0]["env"] == RELATIVE
+    assert (
+        found.only(agent="mine").frame["hash"].tolist()
+        == found.only(agent="class").frame["hash"].tolist()
+    )
+    assert found.only(agent="mine").frame["hash"].nunique() == 1  # each is its first episode

@@ -36,6 +36,10 @@ class PlanningModel:
         foresees: Whether the copies have the noise of the world, and so know what will be drawn.
         threads: Threads of the backend; as many as there are cores if None.
 
+    Attributes:
+        do: As above; it may be replaced.
+        names: As above, each once.
+
     Raises:
         UnknownOption: The backend is unknown, or a number is wrong.
         UnknownVariable: A name does not exist.
@@ -68,7 +72,7 @@ class PlanningModel:
         first = Simulation(copy.copy(task), **options)
         self._copies = [first, *(Simulation(first.structures, **options) for _ in range(count - 1))]
         self._is_foreign = first.engine != world.engine
-        self._do, self._foresees = dict(do or {}), foresees
+        self.do, self._foresees = dict(do or {}), foresees
         self.names = tuple(dict.fromkeys(names))
         self._shapes = {name: world.model.declared(name).shape for name in self.names}
         share = cores() if threads is None else threads
@@ -91,11 +95,11 @@ class PlanningModel:
         if not self._foresees:
             drawn = world.noise.uniforms(STREAM, n=1, episode=world.episode, step=world.index)
             snapshot = replace(snapshot, seed=int(drawn[0, 0] * 2.0**53))
-        if not self._do:
+        if not self.do:
             return snapshot
         believed = self._batch.world(0)
         believed.restore(snapshot)
-        believed.do(self._do)
+        believed.do(self.do)
         return believed.snapshot()
 
     def rollouts(self, start: Snapshot, actions: Floats) -> dict[str, Floats]:

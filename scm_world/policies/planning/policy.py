@@ -230,6 +230,7 @@ class _WorldPlans:
         first, are tried again. The last mean is tried, too; it and the elites are where the next
         search begins.
         """
+        self._model.do = self._policy.do  # which an adaptive agent replaces
         setting, present = self._policy.search, self._model.present(world)
         low, high = action_range(world)
         std = np.broadcast_to(0.5 * setting.spread * (high - low), mean.shape)
