@@ -190,7 +190,7 @@ class Agent:
         Raises:
             FunctionFailure: The method of the policy raised an error.
         """
-        ask = getattr(self._act, "hidden", None)
+        ask = getattr(self._act, "hidden", None) or getattr(self.network, "hidden", None)
         if not callable(ask) or self._seen is None:
             return None
         with blamed(f"the policy {self.about['name']!r}"):
@@ -387,7 +387,8 @@ def as_agent(
     card = PolicyAbout.of({"task": ANY if known is None else known.task, "env": env})
     if known is None:
         begin = partial(_formed, found._begin, card, name)
-        return Agent(found.about, begin, found.policy, card, remembers=found.remembers)
+        how: Any = {"network": found.network, "remembers": found.remembers}
+        return Agent(found.about, begin, found.policy, card, **how)
     for option, given in card.env.items():
         if known.option(option) not in (given, None):
             raise contradiction(option, given, known.option(option), name)
@@ -500,7 +501,7 @@ def _of_object(policy: Any, about: About) -> Agent:
     if isinstance(made, MlpPolicy):
         return _of_network(made, {**about, "sha256": made.sha256}, policy)
     if hasattr(made, "start") and hasattr(made, "act"):
-        how: Any = {"card": getattr(made, "card", None), "remembers": True}
+        how: Any = {"card": getattr(made, "card", None), "network": made, "remembers": True}
         return Agent({**about, "sees": "world"}, partial(_started, made), policy, **how)
     if not hasattr(made, "predict"):
         return Agent(about, partial(_function, made), policy, network=made)
