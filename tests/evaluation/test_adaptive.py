@@ -192,7 +192,7 @@ def test_what_cannot_be_fitted_or_shown_is_refused() -> None:
 
 
 def test_what_it_believes_is_its_hidden_state() -> None:
-    """The fitted mass; the true one, which the environment shows and it is not told, is no control."""
+    """The fitted mass; the true one, which is observed but not told to it, is no control."""
     agent = Adaptive(TOLD, MASS, after=15, measures=MEASURES)
     env = {"max_episode_length": 18}
     first, end = inferred(agent, MASS, task=Cart(), steps=(0,), at=0, n=12, env=env).probes
