@@ -102,9 +102,9 @@ class WorldPolicy:
 class Agent:
     """Acts in an environment, episode after episode; ``as_agent`` makes it.
 
-    What it learns in an episode is gone in the next one, unless its policy has a method ``forget``:
-    then the policy may remember until that is called, which an evaluation does before the first
-    episode of each draw of a protocol.
+    What it learns in an episode is gone in the next one, unless its policy has a method ``forget``
+    (and no attribute ``keeps`` that is false): then the policy may remember until that is called,
+    which an evaluation does before the first episode of each draw of a protocol.
 
     Args:
         about: Description of the policy, as plain data.
@@ -151,7 +151,8 @@ class Agent:
     @property
     def keeps(self) -> bool:
         """Whether its policy remembers earlier episodes, too, until ``forget`` is called."""
-        return callable(getattr(self.policy, "forget", None))
+        forgets = callable(getattr(self.policy, "forget", None))
+        return forgets and bool(getattr(self.policy, "keeps", True))
 
     def forget(self) -> None:
         """Forget all episodes; called where the next one has nothing in common with them."""
@@ -190,7 +191,7 @@ class Agent:
         Raises:
             FunctionFailure: The method of the policy raised an error.
         """
-        ask = getattr(self._act, "hidden", None)
+        ask = getattr(self._act, "hidden", None) or getattr(self.network, "hidden", None)
         if not callable(ask) or self._seen is None:
             return None
         with blamed(f"the policy {self.about['name']!r}"):
@@ -387,7 +388,8 @@ def as_agent(
     card = PolicyAbout.of({"task": ANY if known is None else known.task, "env": env})
     if known is None:
         begin = partial(_formed, found._begin, card, name)
-        return Agent(found.about, begin, found.policy, card, remembers=found.remembers)
+        rest: Any = {"network": found.network, "remembers": found.remembers}
+        return Agent(found.about, begin, found.policy, card, **rest)
     for option, given in card.env.items():
         if known.option(option) not in (given, None):
             raise contradiction(option, given, known.option(option), name)
@@ -500,7 +502,7 @@ def _of_object(policy: Any, about: About) -> Agent:
     if isinstance(made, MlpPolicy):
         return _of_network(made, {**about, "sha256": made.sha256}, policy)
     if hasattr(made, "start") and hasattr(made, "act"):
-        how: Any = {"card": getattr(made, "card", None), "remembers": True}
+        how: Any = {"card": getattr(made, "card", None), "network": made, "remembers": True}
         return Agent({**about, "sees": "world"}, partial(_started, made), policy, **how)
     if not hasattr(made, "predict"):
         return Agent(about, partial(_function, made), policy, network=made)
