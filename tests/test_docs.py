@@ -57,6 +57,21 @@ def test_python_in_documents_runs(path: Path, capsys: pytest.CaptureFixture[str]
         pytest.skip(missing)
 
 
+QUESTION = re.compile(r"^\| [^|]+\? \| `([^`]+)` \| \[", re.MULTILINE)
+
+
+def test_calls_of_the_page_of_questions_run() -> None:
+    """Each call of a row runs with the names of the page's program."""
+    text = (ROOT / "docs" / "questions.md").read_text()
+    names: dict[str, object] = {"__name__": "document"}
+    for found in BLOCK.finditer(text):
+        exec(found[1], names)  # noqa: S102 # our own text
+    calls = QUESTION.findall(text)
+    assert len(calls) == text.count("? | ") > 30
+    for call in calls:
+        assert eval(call, names) is not None, call  # noqa: S307 # our own text
+
+
 NOTEBOOKS = ROOT / "docs" / "notebooks"
 
 
