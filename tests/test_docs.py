@@ -138,6 +138,20 @@ def test_every_page_is_in_the_navigation_once() -> None:
     assert sorted(named) == sorted(str(path.relative_to(ROOT / "docs")) for path in pages)
 
 
+def test_texts_for_language_models_have_every_page_and_no_dead_link() -> None:
+    """``llms.txt`` lists each page with a sentence; links of both files lead to files."""
+    made = runpy.run_path(str(ROOT / ".ci" / "llms.py"))
+    short, whole = made["texts"](made["pages"]())
+    listed = re.findall(r"^- \[[^\]]+\]\((\S+)\): (?=[A-Z`]).+$", short, re.MULTILINE)
+    pages = [path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")]
+    assert sorted(listed) == sorted(pages)
+    links = re.findall(r"\]\(([^)#]+)[^)]*\)|src=\"([^\"]+)\"", short + whole)
+    inner = {one or other for one, other in links if "://" not in one + other}
+    assert len(inner) > len(pages)
+    assert [one for one in inner if not (ROOT / "docs" / one).exists()] == []
+    assert not re.search(r"^--8<--|^:::", whole, re.MULTILINE)
+
+
 def test_modules_of_the_reference_exist() -> None:
     """Every module that the reference documents can be imported."""
     pages = "".join(path.read_text() for path in (ROOT / "docs" / "reference").glob("*.md"))
