@@ -15,7 +15,7 @@ import typer
 
 from scm_world._arguments import one_of
 from scm_world.cli import console, options
-from scm_world.cli.options import load_system, parse_assignments, parse_value, split, tag
+from scm_world.cli.options import load_system, parse_assignments, parse_value, refused, split, tag
 from scm_world.errors import ConflictingTargets, UnknownOption
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ def train(
     device: str = "auto",
     log: options.Text = None,
     sweep: options.Pairs = None,
-    trials: Annotated[int, typer.Option(min=1)] = 20,
+    trials: Annotated[int | None, typer.Option(min=1)] = None,
     onnx: bool = False,
     show_recipe: bool = False,
     common: Training,
@@ -109,7 +109,7 @@ def train(
             several with commas; by default tensorboard, if the library has it.
         sweep: Search for a value of the recipe: NAME=LOW:HIGH, NAME=LOW:HIGH:log, or NAME=[A,B] for
             one of a list. Each trial is a training; the best recipe is in best.json.
-        trials: Trainings of a search.
+        trials: Trainings of a search; 20 by default.
         onnx: Write the policy as ONNX, too.
         show_recipe: Print the recipe as JSON, and do nothing.
     """
@@ -131,6 +131,8 @@ def train(
     if show_recipe:
         typer.echo(made.to_json())
         return
+    if trials is not None and not sweep:
+        raise UnknownOption("trials", trials, ("none without --sweep NAME=LOW:HIGH",))
 
     from scm_world.training import loop
 
@@ -141,7 +143,7 @@ def train(
         space = parse_assignments(sweep, "'--sweep'", _range)
         how: dict[str, Any] = {"start": start, "device": device, "threads": threads, "log": log}
         with common.job(task, "sweep", *words, files="results/*.json", what="trials") as job:
-            tried = search(made, space, trials=trials, **how, **job)
+            tried = search(made, space, trials=trials or 20, **how, **job)
         console.frame(
             [{"trial": r["number"], "score": r["score"], **r["values"]} for r in tried.rows]
         )
@@ -389,6 +391,7 @@ def explain(
     """
     from scm_world.evaluation import Evaluation, Inferred, why
     from scm_world.evaluation.statistics.causes import missing
+    from scm_world.evaluation.verdicts import verdicts_of
 
     if trust:
         sys.path.insert(0, str(Path.cwd()))  # for modules of the working directory
@@ -415,7 +418,8 @@ def explain(
         reasons = why(found.only(**chosen), protocol, episode, **how, progress=tell)
     title = f"{protocol}, episode {episode}: {metric.replace('_', ' ')} {reasons.score:.3g}"
     matter = [one.variable for one in reasons.others if one.gain]
-    console.say(title, reasons, *missing({} if judged is None else judged.verdicts(), matter))
+    verdicts = verdicts_of(judged, found.about, chosen["agent"])
+    console.say(title, reasons, *missing(verdicts, matter))
 
 
 def infer(
@@ -475,6 +479,8 @@ def infer(
     if trust:
         how["trusted"] = (*trust, *(name.partition(".")[0] for name in named))
     if steps is not None:
+        if not all(map(str.isdecimal, split(steps))):
+            raise refused(steps, "expected control steps with commas, such as 5,25", "'--steps'")
         how["steps"] = [int(word) for word in split(steps)]
     drawn = evaluation.Protocol("drawn", split(variables), space)
     with jobs.open("episodes", folder, "parts/*.npz", "files") as job:

@@ -96,6 +96,9 @@ class Adaptive:
         self._told = {} if self._planner is None else dict(self._planner.do)
         self._agent = as_agent(policy if self._planner is None else WorldPolicy(self._planner))
         self.parameters, self.measures = as_names(parameters), dict(measures)
+        for name in ("parameters", "measures"):
+            if not getattr(self, name):
+                raise UnknownOption(name, getattr(self, name), ("one name or more",))
         self.after = whole_number("after", after, least=1)
         self.every = None if every is None else whole_number("every", every, least=1)
         self.iterations = whole_number("iterations", iterations, least=1)

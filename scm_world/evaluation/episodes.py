@@ -393,15 +393,19 @@ def in_world(policy: object, world: World) -> Policy:
         **options,
     )
     history = env.history
-    remembers = agent.remembers or history is not None
+
+    def require_one_world(does: bool) -> None:
+        if not does:
+            problem = "a policy with a memory acts from the first control step on, in one world"
+            raise ActionError(f"{problem}; make one for each branch, and begin at step 0", None)
+
     last, action, sent = (-1, -1, -1), np.empty(0), np.empty(0)
 
     def act(now: World) -> Floats:
         nonlocal last, action, sent
         present = now.noise.seed, now.episode, now.index
-        if now.index > 0 and remembers and present != (*last[:2], last[2] + 1):
-            problem = "a policy with a memory acts from the first control step on, in one world"
-            raise ActionError(f"{problem}; make one for each branch, and begin at step 0", None)
+        goes_on = now.index == 0 or present == (*last[:2], last[2] + 1)
+        require_one_world(goes_on or (history is None and not agent.remembers))
         if history is not None and now.index > 0:  # somebody else may have decided
             played = now.row.actions
             taken = action if np.array_equal(played, sent) else env.actions.toward(played)
@@ -413,6 +417,7 @@ def in_world(policy: object, world: World) -> Policy:
             agent.start(env)
         last = present
         action = agent.act(env.observe())
+        require_one_world(goes_on or not agent.remembers)
         sent = env.actions.command(action)
         return sent
 

@@ -26,7 +26,7 @@ from scm_world.evaluation.statistics import (
     find_causes,
     mean_interval,
 )
-from scm_world.evaluation.verdicts import Inferred
+from scm_world.evaluation.verdicts import Inferred, verdicts_of
 from scm_world.runs.files import (
     Location,
     located,
@@ -179,7 +179,8 @@ class Evaluation:
         """The evaluation with a row for each draw, with the means of the episodes that repeat it.
 
         Its column ``episode`` has the number of the draw. Estimates are over draws, since episodes
-        of one draw depend on one another.
+        of one draw depend on one another. What is drawn anew in each of them, such as a start
+        state, has its mean, too.
         """
         about = {one["name"]: dict(one) for one in self.about.get("protocols", ())}
         times = {name: one.pop("repeats", 1) for name, one in about.items()}
@@ -193,7 +194,10 @@ class Evaluation:
             if name not in KEYS
         }
         frame = self.frame.assign(episode=self.frame["episode"] // each)
-        frame = frame.groupby([*KEYS], sort=False, as_index=False).agg(how)
+        groups = frame.groupby([*KEYS], sort=False, as_index=False)
+        for label in (one for columns in drawn_columns(frame).values() for one in columns):
+            how[label] = "mean" if (groups[label].nunique()[label] > 1).any() else "first"
+        frame = groups.agg(how)
         return replace(self, about={**self.about, "protocols": [*about.values()]}, frame=frame,
                        rewards=None)  # fmt: skip
 
@@ -484,6 +488,9 @@ class Evaluation:
 
         With ``inferred``, what the function of this name has found for the agent, the table says
         which variables the agent infers, and which of those that matter it does not.
+
+        Raises:
+            UnknownOption: A name is unknown, or ``inferred`` is about another policy.
         """
         metric = self.metric(metric)
         agent, engine = self.the("agent", agent), self.the("engine", engine)
@@ -496,7 +503,7 @@ class Evaluation:
         tested = {name: values for name, values in varied.items() if name not in silent}
         found = find_causes(tested, scores, proportion=RATES[metric])
         left_out = {**found.left_out, **dict.fromkeys(silent, NO_PATH)}
-        verdicts = {} if inferred is None else inferred.verdicts()
+        verdicts = verdicts_of(inferred, self.about, agent)
         return replace(found, left_out=left_out, verdicts=verdicts)
 
     # --- files --------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, final
 
-from scm_world.errors import reading
+from scm_world.errors import UnknownOption, reading
 from scm_world.evaluation.statistics.causes import aligned
 from scm_world.evaluation.statistics.intervals import Interval
 from scm_world.evaluation.statistics.probes import Scores
@@ -195,6 +195,23 @@ class Inferred:
                 fields = [{k: v for k, v in one.items() if k != "verdict"} for one in data[name]]
                 data[name] = tuple(kind(**one) for one in fields)
             return cls(**data)
+
+
+def verdicts_of(found: Inferred | None, about: Mapping[str, Any], agent: str) -> dict[str, str]:
+    """Return the verdicts, none without ``found``, about an agent of an evaluation.
+
+    Raises:
+        UnknownOption: They are about another policy: another file, or one of another name.
+    """
+    if found is None:
+        return {}
+    its, mine = (
+        {p.get("sha256", p["name"]) for p in (a["policy"] for a in there if a["agent"] == name)}
+        for name, there in (("agent", found.about["agents"]), (agent, about["agents"]))
+    )
+    if not its & mine:
+        raise UnknownOption("inferred", sorted(its)[0], (*sorted(mine), f"the policy of {agent!r}"))
+    return found.verdicts()
 
 
 def _read(value: dict[str, Any]) -> Any:

@@ -128,7 +128,7 @@ class Agent:
     ) -> None:
         self.about: About = dict(about)
         self.policy, self.card, self.network = policy, card, network
-        self.remembers = remembers
+        self._remembers = remembers
         self._begin = begin
         self._env: PolicyEnv | None = None
         self._act: Actor | None = None
@@ -147,6 +147,15 @@ class Agent:
         """
         with blamed(f"the policy {self.about['name']!r}"):
             self._env, self._act, self._seen = env, self._begin(env), None
+
+    @property
+    def remembers(self) -> bool:
+        """Whether its actions follow from earlier control steps of the episode, too.
+
+        Of a model with ``predict`` that is known after its first action.
+        """
+        carries = isinstance(self._act, _Recurrent) and self._act.state is not None
+        return self._remembers or carries
 
     @property
     def keeps(self) -> bool:
@@ -283,12 +292,12 @@ class _Recurrent:
     def __init__(self, model: Any, seen: LinearMap | None) -> None:
         self._model, self._seen = model, seen
         self._before: Any = None
-        self._state: Any = None
+        self.state: Any = None
         self._first = True
 
     def __call__(self, observation: Observation) -> object:
-        self._before, first = self._state, np.array([self._first])
-        action, self._state = self._model.predict(
+        self._before, first = self.state, np.array([self._first])
+        action, self.state = self._model.predict(
             self._shown(observation), state=self._before, episode_start=first, deterministic=True
         )
         self._first = False
@@ -296,7 +305,7 @@ class _Recurrent:
 
     def hidden(self, observation: Observation) -> Floats | None:
         """Return the hidden state of the last action, which followed from this observation."""
-        ask, state = getattr(self._model, "hidden", None), self._state
+        ask, state = getattr(self._model, "hidden", None), self.state
         parts = [ask(self._shown(observation), self._before)] if callable(ask) else []
         parts += [] if state is None else state if isinstance(state, tuple) else [state]
         return np.concatenate([*map(np.ravel, parts)]) if parts else None

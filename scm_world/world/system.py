@@ -249,15 +249,16 @@ class CausalSystem(ABC):
             InterventionError: The intervention was refused. The episode has begun without it.
         """
         request = request_of(do)
+        if draws is not None and self.backend is None:
+            raise UnknownOption("draws", draws, ("None: equations draw by their own episode",))
+        drawn = None if draws is None else whole_number("draws", draws, least=0)
         if seed is not None:
             self.noise, self.episode = self._noise_of(seed, episode)
         elif not self.has_begun:
             self.noise, self.episode = CompiledNoise(secrets.randbits(63)), 0
         else:
             self.episode = self.episode + 1
-        if draws is not None and self.backend is None:
-            raise UnknownOption("draws", draws, ("None, of equations",))
-        self.draws = None if draws is None else whole_number("draws", draws, least=0)
+        self.draws = drawn
         self._begin()
         self.requested = {}
         return self.do(request, space=space) if request else None

@@ -142,3 +142,10 @@ def test_an_agent_is_trained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     other = called("pushing", *SMALL, f"--out={folder}", "--seed=1")
     assert other.exit_code == 2
     assert "seed (0 there, 1 here)" in other.output.replace("\n", " ")
+
+
+def test_trials_are_of_a_search() -> None:
+    """Without one there would be a single training."""
+    found = called("pushing", *SMALL, "--trials=3")
+    assert found.exit_code == 2
+    assert "--sweep" in found.output

@@ -39,6 +39,18 @@ def test_a_draw_that_is_repeated_has_the_same_parameters_and_other_noise() -> No
     assert "repeats" not in once.about["protocols"][0]
 
 
+def test_draws_that_are_refused_change_nothing() -> None:
+    """The world goes on in its own episode, with its own noise."""
+    env, same = ScmWorldEnv(Aim()), ScmWorldEnv(Aim())
+    for one in (env, same):
+        one.reset(seed=3)
+    with pytest.raises(UnknownOption, match="draws"):
+        env.world.reset(seed=4, episode=7, draws=-1)
+    seen = [one.step(np.zeros(1, np.float32))[0] for one in (env, same)]
+    np.testing.assert_array_equal(*seen)
+    assert env.world.episode == 0
+
+
 def test_what_is_drawn_within_an_episode_is_the_same_in_each_repeat() -> None:
     """And a world that is restored before it draws it again, too."""
     found = aimed("still", "A:offset@2", repeats=3, steps=True)
@@ -191,3 +203,20 @@ def test_the_command_line_prints_what_was_learned(tmp_path: Path) -> None:
     for said in ("regret to still", "last - first", "since the intervention"):
         assert said in found.output
     assert (tmp_path / "steps.parquet").exists()
+
+
+def test_what_is_drawn_anew_within_a_draw_has_its_mean() -> None:
+    """So the slope of a mean score is that of a score; a value that holds keeps its bits."""
+    rng, held = np.random.default_rng(0), [0.1, 0.7]
+    start = rng.normal(size=(2, 3))
+    rows = [
+        {"agent": "a", "run": 0, "engine": "step", "protocol": "A", "seed": 0, "episode": 3 * i + k,
+         "steps": 1, "return": start[i, k], "hash": "", "drawn start": start[i, k],
+         "drawn mass": held[i]}
+        for i in range(2) for k in range(3)
+    ]  # fmt: skip
+    found = Evaluation({"protocols": [{"name": "A", "repeats": 3}]}, pandas.DataFrame(rows))
+    frame = found.by_draw.frame
+    np.testing.assert_allclose(frame["drawn start"], start.mean(axis=1))
+    np.testing.assert_allclose(frame["return"], frame["drawn start"])
+    assert frame["drawn mass"].tolist() == held

@@ -203,6 +203,8 @@ def test_what_cannot_be_fitted_or_shown_is_refused() -> None:
         (NotIntervenable, "hinge.position", MEASURES),
         (UnknownOption, MASS, {"hinge.position": 0.0}),
         (UnknownOption, "delay", MEASURES),
+        (UnknownOption, [], MEASURES),
+        (UnknownOption, MASS, {}),
     ):
         with pytest.raises(error):
             as_agent(Adaptive(TOLD, parameters, measures=measures)).start(shown)

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from scm_world import Action, Box, Exogenous, Measured, StepTask
 from scm_world.cli.app import app
 from scm_world.env import ScmWorldEnv
-from scm_world.errors import ScmWorldError, UnreadableFile
+from scm_world.errors import ScmWorldError, UnknownOption, UnreadableFile
 from scm_world.evaluation import Inferred, Protocol, evaluate, inferred
 from scm_world.evaluation.statistics.probes import probe
 from scm_world.policies import MlpPolicy, WorldPolicy, as_agent
@@ -297,6 +297,9 @@ def test_causes_that_matter_and_are_not_inferred_are_marked() -> None:
     assert "color" in text
     assert "not probed" in text
     assert "inferred" not in str(found.causes("A"))
+    others = inferred(Learner(), "mass", task=Cart(), at=0, **{**HOW, "n": 12})
+    with pytest.raises(UnknownOption, match="the policy of 'Blind'"):
+        found.causes("A", inferred=others)
 
 
 def test_the_command_writes_and_explain_reads(tmp_path: Path) -> None:
@@ -304,6 +307,8 @@ def test_the_command_writes_and_explain_reads(tmp_path: Path) -> None:
     task, agent = f"{__file__}:Cart", "test_inference:Blind"
     call = partial(CliRunner(env={"COLUMNS": "200"}).invoke, app)
     given = ["infer", agent, task, "--variables=mass", "-n12", "--at=2", "--after=1", "--steps=3"]
+    done = call([*given, "--workers=1", "--steps=five"])
+    assert "expected control steps" in done.output, done.output
     done = call([*given, "--workers=1", f"--out={tmp_path}"])
     assert done.exit_code == 0, done.output
     assert "no change" in done.output

@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 
 from scm_world.errors import ActionError, ModelError, UnknownOption, UnreadableFile
+from scm_world.evaluation import in_world
 from scm_world.policies import Layer, MlpPolicy
 from scm_world.policies.agents import NAMES, WorldPolicy, agent_from, as_agent, checked
-from scm_world.queries import Random
+from scm_world.queries import Random, World
 
 STEPS = 6
 
@@ -116,6 +117,21 @@ def test_a_model_remembers_until_the_reset() -> None:
     np.testing.assert_allclose(first[:, 0], np.arange(1, STEPS + 1) / 10)
     np.testing.assert_array_equal(first, second)
     assert model.starts == [True] + [False] * (STEPS - 1) + [True] + [False] * (STEPS - 1)
+
+
+def test_a_recurrent_model_acts_in_no_branch_of_an_episode() -> None:
+    """Its memory is that of another branch, or of no steps at all."""
+    world = World("pushing", backend="fake")
+    acts = in_world(Recurrent(), world)
+    world.reset(seed=0)
+    for _ in range(2):
+        world.step(acts(world))
+    saved = world.snapshot()
+    world.step(acts(world))
+    world.restore(saved)
+    for policy in (acts, in_world(Recurrent(), world)):
+        with pytest.raises(ActionError, match="a memory"):
+            policy(world)
 
 
 def test_an_object_in_memory_cannot_be_made_again() -> None:
