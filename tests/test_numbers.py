@@ -343,6 +343,10 @@ CASES: dict[str, Case] = {
         ),
         {"n": 2, "seed": 1, "steps": [1], "at": 1, "after": 1, "workers": 1},
     ),
+    "Adaptive": (
+        lambda **k: evaluation.Adaptive("still", "mass", measures={"x": 0.1}, **k).keeps,
+        {"after": 3, "keeps": True},
+    ),
     "play": (
         lambda **k: evaluation.play(gymnasium.make(PUSHING, **SHORT), STILL, **k)[
             "fractional_success"

@@ -398,7 +398,7 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
     }  # fmt: skip
     yield evaluation.Adaptive, {
         "policy": "random", "parameters": "mass", "measures": {"x": 0.1}, "after": 5,
-        "every": None, "iterations": 2, "last": None, "use": "mean",
+        "every": None, "iterations": 2, "last": None, "use": "mean", "keeps": False,
     }  # fmt: skip
     yield evaluation.in_world, {"policy": "random", "world": world}
     yield evaluation.inferred, {

@@ -311,3 +311,14 @@ def test_equations_refuse_what_needs_an_engine(method: str, given: tuple[str, ..
     world = sw.World(MODEL)
     with pytest.raises(ModelError, match=f"no {method}: no engine"):
         getattr(world, method)(*given)
+
+
+def test_a_path_may_have_a_colon(tmp_path: Path) -> None:
+    """As paths of Windows do: it names a file, not a module and a function."""
+    folder = tmp_path / "C:"
+    folder.mkdir()
+    (folder / "pair.json").write_text(to_json(sw.SCM([Exogenous(name="x", default=0.5)])))
+    with sw.World(str(folder / "pair.json")) as world:
+        world.reset(seed=0)
+        assert world["x"] == 0.5
+    assert Spec(str(folder / "arm.xml")).title == "arm.xml"

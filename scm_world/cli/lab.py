@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import secrets
 from contextlib import suppress
@@ -188,6 +187,8 @@ def serve(
         port: Port to serve on; 0 for any that is free.
         token: Token that requests have to carry; a new one if it is left out and needed.
     """
+    import asyncio  # slow to import
+
     from scm_world.lab import mcp as serving
     from scm_world.lab import offers
 

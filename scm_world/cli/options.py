@@ -284,13 +284,13 @@ def tag(name: str) -> str:
     """Return the name of a system in titles and folders: of a file, its stem.
 
     Example:
-        >>> tag("pushing"), tag("models/cartpole.xml"), tag("my.worlds:cartpole")
+        >>> tag("pushing"), tag("C:/models/cartpole.xml"), tag("my.worlds:cartpole")
         ('pushing', 'cartpole', 'my.worlds-cartpole')
     """
+    if name.lower().endswith((".xml", ".mjcf", ".urdf")):
+        return Path(name).stem
     home, colon, function = name.rpartition(":")
-    if colon:
-        return f"{Path(home).stem if home.endswith('.py') else home}-{function}"
-    return Path(name).stem if name.lower().endswith((".xml", ".mjcf", ".urdf")) else name
+    return f"{Path(home).stem if home.endswith('.py') else home}-{function}" if colon else name
 
 
 # --- groups ---------------------------------------------------------------------------------------

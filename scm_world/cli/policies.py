@@ -15,7 +15,7 @@ import typer
 
 from scm_world._arguments import one_of
 from scm_world.cli import console, options
-from scm_world.cli.options import load_system, parse_assignments, split, tag
+from scm_world.cli.options import load_system, parse_assignments, parse_value, split, tag
 from scm_world.errors import ConflictingTargets, UnknownOption
 
 if TYPE_CHECKING:
@@ -83,6 +83,8 @@ def train(
     start: Path | None = None,
     device: str = "auto",
     log: options.Text = None,
+    sweep: options.Pairs = None,
+    trials: Annotated[int, typer.Option(min=1)] = 20,
     onnx: bool = False,
     show_recipe: bool = False,
     common: Training,
@@ -105,6 +107,9 @@ def train(
         device: auto, cpu or cuda.
         log: Where the numbers of each round go besides progress.csv: tensorboard, wandb or trackio,
             several with commas; by default tensorboard, if the library has it.
+        sweep: Search for a value of the recipe: NAME=LOW:HIGH, NAME=LOW:HIGH:log, or NAME=[A,B] for
+            one of a list. Each trial is a training; the best recipe is in best.json.
+        trials: Trainings of a search.
         onnx: Write the policy as ONNX, too.
         show_recipe: Print the recipe as JSON, and do nothing.
     """
@@ -130,6 +135,20 @@ def train(
     from scm_world.training import loop
 
     words = "train", tag(made.task), made.algo, made.name
+    if sweep:
+        from scm_world.training.sweep import sweep as search
+
+        space = parse_assignments(sweep, "'--sweep'", _range)
+        how: dict[str, Any] = {"start": start, "device": device, "threads": threads, "log": log}
+        with common.job(task, "sweep", *words, files="results/*.json", what="trials") as job:
+            tried = search(made, space, trials=trials, **how, **job)
+        console.frame(
+            [{"trial": r["number"], "score": r["score"], **r["values"]} for r in tried.rows]
+        )
+        console.written(tried.folder / "sweep.json", tried.folder / "sweep.csv")
+        if tried.best is not None:
+            console.say(f"train:    scm-world train {task} --recipe {tried.folder / 'best.json'}")
+        return
     with common.job(task, *words, files="checkpoints/*.zip", what="steps") as job:
         found = loop.train(made, start=start, device=device, threads=threads, log=log, **job)
     common.tell(found, made.task)
@@ -137,6 +156,12 @@ def train(
         from scm_world.training.export import to_onnx
 
         console.say(f"ONNX:     {to_onnx(found.best, found.best.with_suffix('.onnx'))}")
+
+
+def _range(text: str, hint: str) -> object:
+    """Read ``LOW:HIGH`` and ``LOW:HIGH:log``; any other value as it is."""
+    ends = [parse_value(one, hint) for one in text.split(":")]
+    return tuple(ends) if len(ends) > 1 else ends[0]
 
 
 def clone(

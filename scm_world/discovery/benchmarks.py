@@ -346,7 +346,8 @@ def _write_models(folder: Location, givens: Sequence[str | SCM], shown: Sequence
             with suppress(ModelError):  # functions without a name
                 write_whole(folder / f"{slug(label)}.json", to_json(given))
             continue
-        path = Path(given.rpartition(":")[0] or given)  # file.py:function
+        home, _, _ = given.rpartition(".py:")
+        path = Path(f"{home}.py" if home else given)  # file.py:function
         if path.suffix in (*FILES, ".json", ".py"):
             write_whole(folder / f"{slug(label)}{path.suffix}", read_bytes(path))
             for file, name in _named_in(path).items():

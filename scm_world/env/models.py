@@ -114,7 +114,8 @@ def vector_env(
     # A server that has imported this package starts processes quickest.
     kinds = multiprocessing.get_all_start_methods()
     how["context"] = "forkserver" if "forkserver" in kinds else "spawn"
-    multiprocessing.get_context(how["context"]).set_forkserver_preload([__name__])
+    if "forkserver" in kinds:
+        multiprocessing.get_context("forkserver").set_forkserver_preload([__name__])
     with single_threaded(here=False):
         return AsyncVectorEnv([partial(member, **found)] * count, max_concurrency=workers, **how)
 

@@ -8,7 +8,7 @@ from typing import Any, final
 
 import numpy as np
 
-from scm_world._arguments import one_of, typed, whole_number
+from scm_world._arguments import one_of, true_or_false, typed, whole_number
 from scm_world._patterns import as_names
 from scm_world._types import Floats, Observation
 from scm_world.env import ScmWorldEnv
@@ -52,6 +52,8 @@ class Adaptive:
             an episode; all if None.
         use: ``"mean"``: it acts by the fitted values; ``"draw"``: by a draw from what the fit
             leaves open, anew after each fit, from the noise of the episode.
+        keeps: Whether what it believes holds in the next episode, too, until ``forget`` is called:
+            for draws of protocols that are repeated. Each fit is of one episode.
 
     Attributes:
         history: A dictionary for each fit of the episode: ``step``, the believed ``values`` from
@@ -87,6 +89,7 @@ class Adaptive:
         iterations: int = 8,
         last: int | None = None,
         use: str = "mean",
+        keeps: bool = False,
     ) -> None:
         inside = policy.policy if isinstance(policy, WorldPolicy) else policy
         self._planner = copy.copy(inside) if isinstance(inside, CrossEntropy) else None
@@ -98,7 +101,7 @@ class Adaptive:
         self.iterations = whole_number("iterations", iterations, least=1)
         self.last = None if last is None else whole_number("last", last, least=2)
         one_of("use", use, USES)
-        self.use = use
+        self.use, self.keeps = use, true_or_false("keeps", keeps)
         self.history: list[dict[str, Any]] = []
         self._env: ScmWorldEnv | None = None
 
@@ -109,7 +112,7 @@ class Adaptive:
 
     def __fingerprint__(self) -> dict[str, Any]:
         """Return all that decides what it does."""
-        how = (self.after, self.every, self.iterations, self.last, self.use)
+        how = (self.after, self.every, self.iterations, self.last, self.use, self.keeps)
         about = {n: v for n, v in self._agent.about.items() if n not in ("path", "fingerprint")}
         policy: Any = None if "sha256" in about else self._agent.policy
         if self._planner is not None:
@@ -120,18 +123,25 @@ class Adaptive:
 
     def __getstate__(self) -> dict[str, Any]:
         """Copy and pickle without the episode."""
-        private = ("_shadow", "_fit", "_seen")
+        private = ("_shadow", "_fit", "_seen", "_scaled")
         state = {name: value for name, value in vars(self).items() if name not in private}
         return {**state, "_env": None, "history": []}
 
     def start(self, env: ScmWorldEnv) -> None:
-        """Begin an episode, with the declared values of the parameters."""
+        """Begin an episode, with the declared values of the parameters, unless it keeps others."""
         if env is not self._env:
             self._prepare(env)
-        self._fit.begin()
+        if not self.keeps:
+            self.forget()
         self.history, self._values, self._commands = [], list[Floats](), list[Floats]()
-        self._believe(self._fit.scaled)
+        self._believe(self._scaled)
         self._agent.start(env)
+
+    def forget(self) -> None:
+        """Believe the declared values of the parameters again."""
+        if self._env is not None:
+            self._fit.begin()
+            self._scaled = self._fit.scaled
 
     def act(self, observation: Observation) -> Actions:
         """Fit, if it is time, and choose an action."""
@@ -172,6 +182,7 @@ class Adaptive:
             allowed = ("one that observes it: as_agent(policy, env={'context': 'observation'})",)
             raise UnknownOption(f"policy that does not observe {missing!r}", "this one", allowed)
         self._env = env
+        self.forget()
 
     def _believe(self, scaled: Floats) -> None:
         """Act by these parameters from now on."""

@@ -670,7 +670,8 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """Begin an episode; the last one is kept.
 
         Raises:
-            UnknownOption: ``info`` has no such name as one that should be kept.
+            UnknownOption: ``info`` has no such name as one that should be kept, or the draws are
+                those of another episode.
         """
         self._keep()
         observation, info = self.env.reset(seed=seed, options=options)
@@ -728,6 +729,9 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         world = self._inner.world
         self._version, self._did = world.version, self._inner.interventions
         self._place = world.noise.seed, world.episode
+        if world.draws is not None:
+            allowed = ("None: a replay draws by the number of the episode itself",)
+            raise UnknownOption("draws of a recorded episode", world.draws, allowed)
         for name in self._wanted:
             one_of("info", name, info)
         copied: Observation = whole({n: np.array(part) for n, part in parts(observation).items()})

@@ -320,7 +320,7 @@ class Diagnosing:
                 scaled=at.scaled,
                 starts=np.array(at.starts),
                 noise=self._noise,
-                given=np.full(len(self._noise), True),
+                known=np.full(len(self._noise), True),
                 found=tuple(at.made),
                 spans=shooting.spans,
                 ended=at.ended,

@@ -271,7 +271,7 @@ def described(minima: Minima, active: Sequence[int], best: Result) -> Fit:
     problem, simulator = minima.problem, minima.problem.simulator
     targets = tuple(problem.targets[i] for i in active)
     about = simulator.world, problem.measured, targets, problem.window, best.at.scaled[[*active]]
-    states = np.array(best.at.starts), best.noise, problem.known
+    states = np.array(best.at.starts), best.noise, problem.given, problem.known
     found = tuple(minima.certain(best, active))
     return Fit(*about, *states, found, simulator.spans, ended=best.at.ended)
 

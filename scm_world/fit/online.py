@@ -114,7 +114,7 @@ class OnlineFit:
         at = gauss_newton(squares, self.scaled, [*shooting.guess(problem.segments)])
         self.scaled = at.scaled
         firsts = np.cumsum([0, *map(len, problem.joined[:-1])])
-        states = np.array(at.starts)[firsts], problem.noise, problem.known
+        states = np.array(at.starts)[firsts], problem.noise, problem.given, problem.known
         linear = tuple(at.made), shooting.spans
         rest: Any = {"ended": not at.smooth}
         targets, window = self.targets, problem.window

@@ -234,7 +234,8 @@ class FitProblem:
         joined: The segments of each window.
         segments: All segments.
         noise: Standard deviation of each column, given or estimated, shape (columns,).
-        known: Columns whose noise was given, shape (columns,).
+        given: Columns whose noise was given, shape (columns,).
+        known: Those whose noise is not estimated in a search, shape (columns,); see ``know``.
         reached: Where the last linearisation of all parameters and the whole recording was: scaled
             parameters, segments, and their start states.
     """
@@ -253,7 +254,7 @@ class FitProblem:
         self.windows = [[one] for one in windows_of(measured.runs, self.window)]
         self.joined = [segments_of(one) for (one,) in self.windows]
         self.segments = [segment for group in self.joined for segment in group]
-        self.known = np.isfinite(noise)
+        self.given = self.known = np.isfinite(noise)
         self.noise = np.where(self.known, noise, measured.noise)
         self.reached: tuple[Floats, Sequence[Window], Sequence[Floats]] | None = None
         self._last: dict[tuple[Window, bytes, bytes], Simulated] = {}
@@ -389,7 +390,7 @@ class FitProblem:
         return FitProblem(self.simulator, measured, self.targets, noise, self.window)
 
     def know(self, noise: Floats) -> None:
-        """Take a noise as given."""
+        """Take a noise as known, although it was not given."""
         self.noise = np.maximum(noise, self.measured.least)
         self.known = np.full(len(noise), True)
 

@@ -74,7 +74,9 @@ if TYPE_CHECKING:
 CONFIDENCE = 0.95
 
 DETERMINED = 0.25  # largest standard error of a determined combination: a share of the value
-MISFIT = 1.5  # least residual that the noise does not explain, in standard deviations of it
+MISFIT = 1.5  # least residual that estimated noise does not explain, in standard deviations of it
+EXCESS = 1.1  # the same of given noise, if it is significant
+ALARM = 1e-3  # chance that given noise alone is significant in any column
 CORRELATED = 2.0  # standard errors of a correlation of residuals that is none of noise
 AWAY = 0.5  # of the spread of a state in the recording, at which it is far from rest
 WORSE = 1.1  # times the error of the unfitted world, with which a fit replays worse than it
@@ -99,6 +101,7 @@ class Fit:
         starts: Start state of each window, shape (w, size).
         noise: Standard deviation of the noise of each column, given or estimated, shape (columns,).
         given: Columns whose noise was given, shape (columns,).
+        known: Columns whose noise was known before the search, given or not, shape (columns,).
         found: The windows, linearised at the fit.
         spans: Size of a scaled unit of each free number of a start state, shape (k,).
         reach: How far the intervals reach down and up, scaled, those of an inertia in the numbers
@@ -132,6 +135,7 @@ class Fit:
     starts: Floats
     noise: Floats
     given: NDArray[np.bool_]
+    known: NDArray[np.bool_]
     found: tuple[LinearWindow, ...]
     spans: Floats
     reach: Floats | None = None
@@ -230,20 +234,52 @@ class Fit:
     def misfit(self) -> dict[str, float]:
         """Root mean square of the residuals of each column, in standard deviations of its noise.
 
-        Noise that was not given is judged by the ``roughness`` of the residuals.
+        Noise that was not known is judged by the ``roughness`` of the residuals.
         """
         residual = self.residual
         squares, count = by_column(self.measured.cells[1], residual**2, len(self.columns))
         size = np.sqrt(squares / count * len(residual) / self.degrees)
         own = np.maximum(self.roughness, self.measured.least / self.noise)
-        size = np.where(self.given | np.isnan(own), size, np.sqrt(squares / count) / own)
+        size = np.where(self.known | np.isnan(own), size, np.sqrt(squares / count) / own)
         names = (column.name for column in self.columns)
         return dict(zip(names, map(float, size), strict=True))
 
+    @cached_property
+    def freedom(self) -> Floats:
+        """Effective degrees of freedom: measurements of each column minus leverages, (columns,).
+
+        Source:
+            Hoaglin and Welsch, *The hat matrix in regression and ANOVA*, American Statistician
+            1978: the leverages of linearised least squares; they sum to the fitted numbers.
+        """
+        left, sizes, _ = np.linalg.svd(self.sensitivities, full_matrices=False)
+        each = (left[:, sizes > 1.0 / PRIOR] ** 2).sum(axis=1)
+        each += np.concatenate([(one.fitted[0] ** 2).sum(axis=1) for one in self.found])
+        return by_column(self.measured.cells[1], 1.0 - each, len(self.columns))[0]
+
+    @cached_property
+    def unexplained(self) -> tuple[str, ...]:
+        """Columns whose residuals the noise does not explain.
+
+        Residuals of given noise are too large if two facts hold. Their squares exceed the quantile
+        of χ² which noise alone exceeds in one of a thousand fits, whatever the number of columns:
+        few rows are no misfit by chance. And they are more than 1.1 times the noise: in thousands
+        of rows χ² also rejects the rounding of an engine, a noise that is given 1 % too small, and
+        every real machine. Noise that was not given has an error of its own, and models of real
+        machines leave residuals that follow one another: there the ``misfit`` is at least 1.5.
+        """
+        from scipy.special import chdtri
+
+        squares = by_column(self.measured.cells[1], self.residual**2, len(self.columns))[0]
+        most = chdtri(np.maximum(self.freedom, 1.0), ALARM / len(self.columns))
+        size = np.array([*self.misfit.values()])
+        far = np.where(self.given, (squares > most) & (size > EXCESS), size >= MISFIT)
+        return tuple(one.name for one, wrong in zip(self.columns, far, strict=True) if wrong)
+
     @property
     def explains(self) -> bool:
-        """Whether the residuals are as small as the noise, so that the model can be true."""
-        return max(self.misfit.values()) < MISFIT
+        """Whether no column is ``unexplained``, so that the model can be true."""
+        return not self.unexplained
 
     @property
     def correlated(self) -> bool:
@@ -263,9 +299,8 @@ class Fit:
         Consecutive residuals with correlation ρ have as much information as (1 - ρ) / (1 + ρ) times
         as many independent ones.
         """
-        worst = max(self.misfit.values(), default=1.0)
-        size = max(1.0, self.squares / self.degrees)
-        size = max(size, worst**2) if worst >= MISFIT else size
+        worst = max((self.misfit[name] for name in self.unexplained), default=1.0)
+        size = max(1.0, self.squares / self.degrees, worst**2)
         one, other, _ = self._pairs
         rho = float((one * other).sum()) / self.squares if self.squares else 0.0
         rho = rho if rho > 2.0 / np.sqrt(len(self.residual)) else 0.0
@@ -761,12 +796,12 @@ class Fit:
         """Sentences on what the model does not explain."""
         found = list[str]()
         found += self._before
-        for name, size in self.misfit.items():
-            if size >= MISFIT:
-                said = f"the residuals of {name} are {size:.3g} times as large as its noise"
-                shorter = f"; where bodies bump, window={SHORT} may" * (self.window != SHORT)
-                began = "; or it did not begin as begins= says" * bool(self.measured.begins)
-                found.append(f"{said}: no values that were found explain them{shorter}{began}")
+        for name in self.unexplained:
+            size = self.misfit[name]
+            said = f"the residuals of {name} are {size:.3g} times as large as its noise"
+            shorter = f"; where bodies bump, window={SHORT} may" * (self.window != SHORT)
+            began = "; or it did not begin as begins= says" * bool(self.measured.begins)
+            found.append(f"{said}: no values that were found explain them{shorter}{began}")
         if self.reach is not None and (self.shortened or not self.explains):
             found.append(
                 "the model leaves more than noise: intervals contain what each half of the "

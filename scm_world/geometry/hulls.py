@@ -10,7 +10,7 @@ from typing import Any, final
 
 import numpy as np
 
-from scm_world._arguments import one_of, real_number, typed
+from scm_world._arguments import load, one_of, real_number, typed
 from scm_world._types import ArrayLike, Floats, Integers
 from scm_world.errors import ModelError
 from scm_world.geometry.filling import remainder_kernel
@@ -105,14 +105,14 @@ def load_hull(path: str | PathLike[str], *, scale: float = 1.0) -> Hull:
     Raises:
         ModelError: The file has no volume, too many corners, or cannot be read.
         UnknownOption: The file has another format.
+        MissingExtra: trimesh is not installed; the extra ``meshes`` brings it.
     """
     file = Path(path)
     kind = file.suffix.lower().removeprefix(".")
     one_of("mesh format", kind, FORMATS)
     if real_number("scale", scale) <= 0.0:
         raise ModelError([f"the scale of {file} must be positive and finite, got {scale}"])
-    import trimesh
-
+    trimesh = load("trimesh", "trimesh", "meshes")
     try:
         if not file.is_file():
             raise FileNotFoundError("it is not a regular file, or not there")

@@ -83,7 +83,7 @@ def suite(name: str) -> Suite:
         'servo:5'
     """
     one_of("suite", name, SUITES)
-    return Suite(name, json.loads((MANIFESTS / f"{name}.json").read_text()))
+    return Suite(name, json.loads((MANIFESTS / f"{name}.json").read_text("utf-8")))
 
 
 class Made(NamedTuple):

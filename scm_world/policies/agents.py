@@ -102,9 +102,9 @@ class WorldPolicy:
 class Agent:
     """Acts in an environment, episode after episode; ``as_agent`` makes it.
 
-    What it learns in an episode is gone in the next one, unless its policy has a method ``forget``:
-    then the policy may remember until that is called, which an evaluation does before the first
-    episode of each draw of a protocol.
+    What it learns in an episode is gone in the next one, unless its policy has a method ``forget``
+    (and no attribute ``keeps`` that is false): then the policy may remember until that is called,
+    which an evaluation does before the first episode of each draw of a protocol.
 
     Args:
         about: Description of the policy, as plain data.
@@ -151,7 +151,8 @@ class Agent:
     @property
     def keeps(self) -> bool:
         """Whether its policy remembers earlier episodes, too, until ``forget`` is called."""
-        return callable(getattr(self.policy, "forget", None))
+        forgets = callable(getattr(self.policy, "forget", None))
+        return forgets and bool(getattr(self.policy, "keeps", True))
 
     def forget(self) -> None:
         """Forget all episodes; called where the next one has nothing in common with them."""
@@ -387,7 +388,8 @@ def as_agent(
     card = PolicyAbout.of({"task": ANY if known is None else known.task, "env": env})
     if known is None:
         begin = partial(_formed, found._begin, card, name)
-        return Agent(found.about, begin, found.policy, card, remembers=found.remembers)
+        rest: Any = {"network": found.network, "remembers": found.remembers}
+        return Agent(found.about, begin, found.policy, card, **rest)
     for option, given in card.env.items():
         if known.option(option) not in (given, None):
             raise contradiction(option, given, known.option(option), name)

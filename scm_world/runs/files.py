@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import fcntl
 import io
 import os
 import re
 import shutil
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
-from urllib.parse import unquote
 from uuid import uuid4
 
 import numpy as np
@@ -56,7 +55,9 @@ def located(given: Location | str) -> Location:
     if not slashes:
         return Path(given)
     if protocol in ("file", "local") and rest.removeprefix("localhost").startswith("/"):
-        return Path(unquote(rest.removeprefix("localhost")))
+        from urllib.request import url2pathname  # slow to import
+
+        return Path(url2pathname(rest.removeprefix("localhost")))
     if protocol in ("", "file", "local"):
         raise UnknownOption("URL", given, ("s3://bucket/run", "file:///… with three slashes"))
     if _PASSWORD.search(given):
@@ -191,7 +192,9 @@ def drafted(folder: Location) -> Iterator[Location]:
             draft.rmdir()
         raise
     if isinstance(draft, Path) and isinstance(folder, Path):
-        draft.replace(folder)  # also if that is empty
+        with suppress(OSError):
+            folder.rmdir()  # an empty one, which Windows does not replace
+        draft.replace(folder)
 
 
 @contextmanager
@@ -204,10 +207,21 @@ def locked(folder: Location | str) -> Iterator[None]:
     if not isinstance(path, Path):
         yield
         return
-    handle = os.open(path, os.O_RDONLY)
+    there, flags = path.resolve(), os.O_RDONLY
+    if sys.platform == "win32":  # which opens no folder: a file beside it, gone when it is closed
+        there = there.with_name(f".{there.name}.lock")
+        flags = os.O_RDWR | os.O_CREAT | os.O_TEMPORARY
+    handle = os.open(there, flags)
     try:
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if sys.platform == "win32":
+                import msvcrt
+
+                msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
+            else:
+                import fcntl
+
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             reason = "another process is writing to it"
             raise UnreadableFile(str(path), reason, "wait, or give another folder") from None

@@ -20,7 +20,6 @@ from functools import lru_cache
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from multiprocessing.reduction import ForkingPickler
-from multiprocessing.resource_tracker import ensure_running
 from typing import Any, final
 
 from threadpoolctl import ThreadpoolController
@@ -49,16 +48,35 @@ def piped(
         The process, and the pipe to it, whose other end is the last argument of the function.
     """
     context = multiprocessing.get_context("spawn")
-    pipe, other = context.Pipe()
+    ends: Any = context.Pipe()  # of another class on Windows
+    pipe, other = ends
     process = context.Process(target=target, args=(*given, other), daemon=daemon)
-    ensure_running()  # at its start it would unblock the signal for the process that starts now
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        with other:
-            process.start()
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+    with _deaf(), other:
+        process.start()
     return process, pipe
+
+
+@contextmanager
+def _deaf() -> Iterator[None]:
+    """Let processes that are started meanwhile inherit that Ctrl-C is ignored."""
+    if sys.platform == "win32":
+        from ctypes import windll
+
+        ignore = windll.kernel32.SetConsoleCtrlHandler
+        ignore(None, True)
+        try:
+            yield
+        finally:
+            ignore(None, False)
+    else:
+        from multiprocessing.resource_tracker import ensure_running
+
+        ensure_running()  # at its start it would unblock the signal for the process that starts now
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            yield
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 @final

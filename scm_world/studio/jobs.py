@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import _thread
 import signal
+import threading
 from collections.abc import Callable
+from contextlib import suppress
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -16,7 +19,6 @@ from scm_world.studio.spec import Spec
 def experiment(spec: Spec, kind: str, probes: int, seed: int, pipe: Connection) -> None:
     """Run ``"discover"`` or ``"verify"`` and report results; the pipe is closed at the end."""
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have it ignored
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # this one may be cancelled
     about = {"type": "job", "kind": kind}
     edges: set[Any] = set()
 
@@ -29,6 +31,7 @@ def experiment(spec: Spec, kind: str, probes: int, seed: int, pipe: Connection) 
         pipe.send({**about, "done": done, "planned": planned})
 
     try:
+        threading.Thread(target=_listen, args=(pipe,), daemon=True).start()
         with spec.make() as world:
             common: dict[str, Any] = {"probes": probes, "seed": seed, "found": found}
             found_by: Callable[..., Any] = discover if kind == "discover" else verify
@@ -45,3 +48,10 @@ def experiment(spec: Spec, kind: str, probes: int, seed: int, pipe: Connection) 
         pipe.send({**about, "error": in_one_line(error)})
     finally:
         pipe.close()
+
+
+def _listen(pipe: Connection) -> None:
+    """Interrupt the work once something comes over the pipe."""
+    with suppress(EOFError, OSError):
+        pipe.recv()
+        _thread.interrupt_main()

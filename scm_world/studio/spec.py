@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-import signal
+import sys
 import threading
 from collections.abc import Callable
 from contextlib import suppress
@@ -48,7 +48,8 @@ class Spec:
     def title(self) -> str:
         """The system in few words: of a file, its name."""
         home, _, function = self.system.rpartition(":")
-        return f"{Path(home).stem}:{function}" if home else Path(function).name
+        is_file = not home or self.system.endswith((".xml", ".urdf", ".json"))
+        return Path(self.system).name if is_file else f"{Path(home).stem}:{function}"
 
     def code(self) -> list[str]:
         """Return the lines of Python that make it."""
@@ -66,16 +67,19 @@ class PipedProcess:
 
     def interrupt(self) -> None:
         """Ask it to report the finished part, and to end."""
-        if self._process.pid is not None and self._process.is_alive():
-            os.kill(self._process.pid, signal.SIGINT)
+        with suppress(OSError):  # it has ended
+            self.pipe.send("end")
 
     def close(self, grace: float = GRACE) -> None:
         """Close the way to it, which it reads to the end; end it by force after some time [s].
 
         Nothing is sent: that would wait for a process that is busy and whose pipe is full.
         """
-        with suppress(OSError), socket(fileno=os.dup(self.pipe.fileno())) as way:
-            way.shutdown(SHUT_WR)
+        if sys.platform == "win32":  # no socket there, so that both ways are closed
+            self.pipe.close()
+        else:
+            with suppress(OSError), socket(fileno=os.dup(self.pipe.fileno())) as way:
+                way.shutdown(SHUT_WR)
         self._process.join(grace)
         for end in (self._process.terminate, self._process.kill):
             if self._process.is_alive():

@@ -242,7 +242,7 @@ def _is_saved(source: object) -> bool:
 def is_causal(source: object) -> bool:
     """Return whether something is, or is the name of, a causal model that is made already."""
     if isinstance(source, str) and not is_model(source) and source not in tasks():
-        if ":" in source and not is_family(source):
+        if ":" in source and not (is_family(source) or _is_saved(source)):
             source = load_named(source, "task")
         else:
             return _is_saved(source) or (is_family(source) and source.partition(":")[0] in FAMILIES)

@@ -20,7 +20,7 @@ from scm_world._arguments import load, one_of, whole_number
 from scm_world._fingerprint import fingerprint
 from scm_world._types import Floats, Observation
 from scm_world.env import ScmWorldEnv
-from scm_world.env.observer import context_of
+from scm_world.env.observer import FAILED, context_of
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation.episodes import Hook, in_world, play, under
 from scm_world.evaluation.protocols import chosen, protocols_of
@@ -262,7 +262,7 @@ Demonstrations = dict[str, NDArray[Any]]
 - ``after``: Its memory afterwards, of the same shape.
 - ``lengths``: Rows of each episode that was kept.
 - ``scores``: Fractional success at the end of each episode, shape (episodes,); its return where
-  there is no success.
+  there is no success, and NaN where states grew beyond all bounds.
 - ``kept``: Whether its control steps are there, shape (episodes,).
 """
 
@@ -274,10 +274,10 @@ def successful(
 ) -> Demonstrations:
     """Return demonstrations; ``rows`` are the control steps of all episodes, in order of ``ROWS``.
 
-    Episodes are left out whose score is less than ``keep``; none with 0.
+    Episodes are left out whose score is less than ``keep`` (none with 0), or not a number.
     """
     ends = np.array(scores)
-    kept = (ends >= keep) | (keep == 0.0)
+    kept = (ends >= keep) | ((keep == 0.0) & np.isfinite(ends))
     taken = np.repeat(kept, lengths)
     found = {n: np.array(one, np.float32)[taken] for n, one in zip(ROWS, rows, strict=True)}
     return {**found, "lengths": np.array(lengths)[kept], "scores": ends, "kept": kept}
@@ -301,7 +301,7 @@ def joined(parts: Sequence[Demonstrations]) -> Demonstrations:
         scores = found["scores"]
         problem = (
             f"none of {len(scores)} demonstrations ended well enough to learn from; the best one "
-            f"reached {scores.max(initial=0.0):.3f}: take another teacher, less noise, or a "
+            f"reached {np.nanmax(scores, initial=0.0):.3f}: take another teacher, less noise, or a "
             "smaller keep"
         )
         raise ModelError([problem])
@@ -318,11 +318,14 @@ def demonstrated(
 ) -> Demonstrations:
     """Record episodes of the teacher, and now and then of a learner; those that fail are left out.
 
+    So are those in which states grow beyond all bounds.
+
     The job has the numbers of the episodes and the backend. An episode follows from the seed, the
     round and its number.
     """
     numbers, backend = job
-    with closing(ScmWorldEnv(lesson.task, backend=backend, **lesson.options)) as env:
+    options = {"on_failure": "truncate", **lesson.options}
+    with closing(ScmWorldEnv(lesson.task, backend=backend, **options)) as env:
         metric, teacher = metric_of(env.world.model, lesson), teacher_in(lesson, env.world)
         known = protocols_of(lesson.task)
         taught = [one for name in lesson.protocols for one in chosen([name], known)]
@@ -331,10 +334,10 @@ def demonstrated(
             acting = under(env, taught[number % len(taught)])
             random = np.random.default_rng([seed, round_, number])
             teaching = Teaching(lesson, teacher(), random, learner, metric)
-            play(acting, teaching, hooks=[teaching], seed=SEED + seed, episode=number)
+            info = play(acting, teaching, hooks=[teaching], seed=SEED + seed, episode=number)
             shown += teaching.pairs
             lengths.append(len(teaching.pairs))
-            scores.append(teaching.score)
+            scores.append(float("nan") if info[FAILED] else teaching.score)
     return successful(zip(*shown, strict=True), lengths, scores, lesson.keep)
 
 
@@ -693,7 +696,7 @@ def clone(
                         "round": round_,
                         "control_steps": n,
                         "episodes": episodes,
-                        "teacher": float(pairs["scores"].mean()),
+                        "teacher": float(np.nanmean(pairs["scores"])),
                         "loss": loss,
                         "versions": made_with,
                     },

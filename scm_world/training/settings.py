@@ -280,7 +280,8 @@ def _merged(before: object, value: object) -> Any:
 def presets() -> Mapping[str, Any]:
     """Return the settings that work, of ``presets.yaml``: algorithms, recipes, lessons."""
     yaml = load("yaml", "pyyaml")
-    found: Mapping[str, Any] = yaml.safe_load((Path(__file__).parent / "presets.yaml").read_text())
+    text = (Path(__file__).parent / "presets.yaml").read_text("utf-8")
+    found: Mapping[str, Any] = yaml.safe_load(text)
     return found
 
 

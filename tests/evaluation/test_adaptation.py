@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from scm_world.cli.app import app
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import UnknownOption, UnreadableFile
-from scm_world.evaluation import Evaluation, Protocol, evaluate, why
+from scm_world.evaluation import Evaluation, Protocol, Recorder, evaluate, why
 from scm_world.evaluation.statistics import crossed_interval
 from scm_world.evaluation.statistics.intervals import student
 from scm_world.policies import as_agent
@@ -174,6 +174,10 @@ def test_what_does_not_fit_repeats_is_refused() -> None:
     assert why(found, "A:offset", 3).others[0].would_score <= 0.0
     with pytest.raises(UnknownOption, match="repeats=2 or more"):
         aimed("still", n=1).attempts("A:offset")
+    with pytest.raises(UnknownOption, match="draws of a recorded episode"):
+        Recorder(ScmWorldEnv(Aim())).reset(seed=0, options={"draws": 1})
+    with pytest.raises(UnknownOption, match="draws"):
+        ScmWorldEnv(Aim()).reset(seed=0, options={"draws": -1})
     five = Protocol("five", "offset", repeats=5)
     assert Protocol.from_dict(five.as_dict()) == five
 

@@ -132,6 +132,26 @@ def test_draws_are_of_what_the_fit_leaves_open() -> None:
     assert abs(np.mean(found) - 0.3) < 0.05
 
 
+def test_it_keeps_what_it_believes_in_the_next_episode_if_asked() -> None:
+    """Until it forgets; an evaluation does so before each draw."""
+    agent, env = as_agent(Adaptive(TOLD, MASS, 15, measures=MEASURES, keeps=True)), cart()
+    first = [float(acted(agent, env, 0.3, 20)[1][0, 0]) for _ in range(2)]
+    agent.forget()
+    first.append(float(acted(agent, env, 0.3, 5)[1][0, 0]))
+    np.testing.assert_allclose(first, [0.3, 0.9, 0.3], rtol=1e-3)
+    assert agent.keeps
+    assert not as_agent(adaptive).keeps
+    found = evaluate({"mine": agent, "told": TOLD}, f"A:{MASS}", task=Cart(), n=4, repeats=2)
+    *_, gain = found.attempts(f"A:{MASS}", agent="mine")
+    regret = [
+        one.groupby(one["episode"] % 2)["return"].mean().to_numpy()
+        for one in (found.only(agent=name).frame for name in ("told", "mine"))
+    ]
+    lost = np.abs(regret[0] - regret[1])
+    assert lost[1] < 0.05 * lost[0]
+    assert gain.n == 2
+
+
 def test_a_planner_plans_with_what_is_believed() -> None:
     """First with the declared value, then with the fitted one; the given beliefs stay."""
     planner = CrossEntropy(samples=4, horizon=6, spread=1.0, every=1, do={"slider.damping": 0.4})

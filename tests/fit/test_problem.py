@@ -7,11 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 from scipy.stats import t as student
 
 from scm_world._types import Floats, Integers
 from scm_world.errors import InterventionError
-from scm_world.fit.fitting import fitted
+from scm_world.fit.fitting import described, fitted
 from scm_world.fit.problem import (
     FitProblem,
     LeastSquares,
@@ -75,18 +76,20 @@ def problem(
     true: Floats = TRUE,
     effect: Floats = C,
     most: float = np.inf,
+    rows: int = ROWS,
+    more: Floats | float = 0.0,
 ) -> FitProblem:
     """Return a recording of the system with noise."""
     rng = np.random.default_rng(seed)
-    commands = rng.normal(size=(ROWS - 1, 1))
+    commands = rng.normal(size=(rows - 1, 1))
     system = Linear(commands, effect)
-    ((values, _),) = system.simulate([(Window(0, 0, ROWS), true, STATE)])
+    ((values, _),) = system.simulate([(Window(0, 0, rows), true, STATE)])
     system.most = most
-    values = values + NOISE * rng.normal(size=values.shape)
+    values = values + NOISE * rng.normal(size=values.shape) + more
     values[5:9, 1] = np.nan
     names = ("one", "other", "third")
     columns = tuple(MeasuredNumber(name, name, 0, "m") for name in names)
-    run = RecordedRun(commands, np.arange(ROWS), values)
+    run = RecordedRun(commands, np.arange(rows), values)
     targets = target("a", low), target("b")
     return FitProblem(system, Measurements((run,), columns, 0.1), targets, noise, WINDOW)
 
@@ -303,3 +306,55 @@ def test_the_numbers_of_a_vector_deviate_alone() -> None:
         wald = float(best[:2] @ np.linalg.solve(covariance, best[:2])) / 2.0
         assert fit.deviates("vector") == (wald > fisher.ppf(0.95, 2, fit.degrees))
         assert fit.deviates("vector") == bool(true.any())
+
+
+def test_freedom_of_columns_is_that_of_the_hat_matrix() -> None:
+    """The fitted numbers take away the traces of X (XᵀX)⁻¹ Xᵀ over the rows of each column."""
+    asked = problem()
+    fit = fitted(Minima(asked), (0, 1))
+    _, x, place = design(asked)
+    weighed = x / NOISE[place, None]
+    hat = np.diag(weighed @ np.linalg.solve(weighed.T @ weighed, weighed.T))
+    np.testing.assert_allclose(fit.freedom, np.bincount(place, 1.0 - hat), rtol=1e-3)
+    assert fit.freedom.sum() == pytest.approx(fit.degrees, rel=1e-6)
+
+
+def test_a_term_that_is_missing_is_found_below_one_and_a_half_times_the_noise() -> None:
+    """A wave that no state follows; where the noise was not given, its error may be the cause."""
+    wave = np.zeros((ROWS, 3))
+    wave[:, 1] = 1.4 * NOISE[1] * np.sin(2.0 * np.arange(ROWS))
+    asked = problem(more=wave)
+    fit = described(Minima(asked), (0, 1), Minima(asked).found((0, 1)))
+    y, x, place = design(asked)
+    best, *_ = solution(asked)
+    left = ((y - x @ best)[place == 1] / NOISE[1]) ** 2
+    assert 1.1 < fit.misfit["other"] < 1.5
+    assert chi2.sf(left.sum(), fit.freedom[1]) < 1e-3 / 3
+    assert fit.unexplained == ("other",)
+    assert not fit.explains
+    assert any("residuals of other are" in said for said in fit.remarks)
+    assert fit.discount >= fit.misfit["other"] ** 2
+    unknown = problem(more=wave, noise=np.full(3, np.nan))
+    assert described(Minima(unknown), (0, 1), Minima(unknown).found((0, 1))).explains
+
+
+@pytest.mark.parametrize("rows", [8, 60])
+def test_noise_alone_is_no_misfit(rows: int) -> None:
+    """Right fits explain their recordings: 8 rows, of which some have 1.4 times their noise."""
+    sizes = list[float]()
+    for seed in range(25):
+        asked = problem(seed=seed, rows=rows)
+        fit = described(Minima(asked), (0, 1), Minima(asked).found((0, 1)))
+        sizes.append(max(fit.misfit.values()))
+        assert fit.explains
+    assert max(sizes) > (1.4 if rows == 8 else 1.1)
+
+
+def test_a_small_error_of_the_noise_is_no_misfit() -> None:
+    """In thousands of rows, χ² rejects residuals of 1.05 times the noise: they are explained."""
+    asked = problem(rows=3000, noise=NOISE / 1.06)
+    fit = described(Minima(asked), (0, 1), Minima(asked).found((0, 1)))
+    squares = np.bincount(asked.measured.cells[1], fit.residual**2)
+    assert (chi2.sf(squares, fit.freedom) < 1e-3 / 3).any()
+    assert max(fit.misfit.values()) < 1.1
+    assert fit.explains

@@ -126,6 +126,24 @@ def test_a_trained_teacher_observes_its_own_form(tmp_path: Path) -> None:
     np.testing.assert_array_equal(plain["observations"], wide["observations"][:, :narrow])
 
 
+def test_an_episode_whose_world_is_lost_is_no_example(tmp_path: Path) -> None:
+    """A slider that is pushed becomes unstable; the others of the lesson are learned from."""
+    task = f"{Path(__file__).parents[1] / 'env' / 'test_env_failures.py'}:Growing"
+    with closing(ScmWorldEnv(task)) as env:
+        width = env.observation_space.shape[0]  # type: ignore[index]
+    for push, lost in ((1.0, True), (0.0, False)):
+        tensors = {"layers.0.weight": np.zeros((1, width), np.float32)}
+        tensors["layers.0.bias"] = np.full(1, push, np.float32)
+        path = save_policy(tmp_path / f"{push}.safetensors", tensors, {"task": task})
+        fields = {**QUICK, "teacher": str(path), "env": {"max_episode_length": 100}, "noise": 0.0}
+        found = demonstrated((range(2), "mujoco"), lesson=lesson(task, **fields), seed=0)
+        assert np.isnan(found["scores"]).tolist() == [lost, lost]
+        assert found["kept"].tolist() == [not lost, not lost]
+        assert len(found["actions"]) == (0 if lost else 200)
+    with pytest.raises(ModelError, match=r"none of 2 .* reached 0\.000"):
+        joined([{**found, "actions": found["actions"][:0], "scores": np.full(2, np.nan)}])
+
+
 def test_a_recurrent_student_resumes_and_repeats(tmp_path: Path) -> None:
     """Rounds of a trained teacher, without success: interrupted or not, the same bits."""
     pytest.importorskip("torch")

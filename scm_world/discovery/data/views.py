@@ -101,7 +101,7 @@ def as_dcdi(dataset: Dataset, folder: Path | str, number: int = 1) -> Path:
     np.save(target / f"data_interv{number}.npy", dataset.values)
     for name, table in (("intervention", dataset.targeted), ("soft", dataset.soft)):
         lines = (",".join(map(str, np.flatnonzero(row).tolist())) for row in table)
-        (target / f"{name}{number}.csv").write_text("\n".join(lines) + "\n")
+        (target / f"{name}{number}.csv").write_text("\n".join(lines) + "\n", "utf-8", newline="\n")
     np.savetxt(target / f"regime{number}.csv", _target_sets(dataset, [()]), "%d")
     return target
 
