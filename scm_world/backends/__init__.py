@@ -5,13 +5,13 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable
 from contextlib import closing, suppress
-from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
 
 from scm_world._arguments import enter, one_of, typed
+from scm_world._plugins import Plugins
 from scm_world.backends.base import (
     ROUNDING,
     Backend,
@@ -74,13 +74,21 @@ def register(kind: Kind) -> Kind:
 
 def backends() -> tuple[str, ...]:
     """Name all backends that ``make_backend`` knows: of this package, then the others."""
-    return tuple(dict.fromkeys((*BACKENDS, *_REGISTERED, *_declared())))
+    return tuple(known())
 
 
-@cache
-def _declared() -> dict[str, EntryPoint]:
-    """Find the entry points of installed packages, by name."""
-    return {entry.name: entry for entry in entry_points(group="scm_world.backends")}
+def known() -> Plugins[Callable[[], Backend]]:
+    """Return what makes each of them."""
+    ours = {name: partial(_ours, name) for name in BACKENDS}
+    return Plugins("backends", {**ours, **_REGISTERED}, _declared)
+
+
+def _declared(name: str, found: Any) -> Callable[[], Backend]:
+    """Return what makes the backend that an installed package declares."""
+    made = found() if callable(found) else found
+    if not isinstance(made, Backend):
+        raise ModelError([f"it does not make a Backend for {name!r}, but {made!r}"])
+    return lambda: made
 
 
 @typed
@@ -93,7 +101,7 @@ def make_backend(name: str) -> Backend:
 
     Raises:
         UnknownOption: There is no such backend, or no such device.
-        ModelError: What an installed package declares by this name is not a backend.
+        ModelError: What an installed package declares by this name is not a backend, or fails.
         MissingEngine: Its engine is not installed, or two versions of it lie in one folder.
 
     Example:
@@ -104,14 +112,11 @@ def make_backend(name: str) -> Backend:
     if name == EQUATIONS:
         raise UnknownOption("backend of bodies", name, backends())
     name, _, device = name.partition(":")
-    if name in tuple(_REGISTERED):
-        return _REGISTERED[name]()
-    if name not in BACKENDS:
-        declared = _declared()[name].load()
-        made = declared() if callable(declared) else declared
-        if not isinstance(made, Backend):
-            raise ModelError([f"entry point {name!r}: {declared!r} does not make a Backend"])
-        return made
+    return _ours(name, device) if device else known()[name]()
+
+
+def _ours(name: str, device: str = "") -> Backend:
+    """Create a backend of this package."""
     class_name, requirement = _CLASSES[name]
     try:
         module = importlib.import_module(f"scm_world.backends.{name}")

@@ -14,11 +14,14 @@ import scm_world as sw
 from scm_world._arguments import load, one_of
 from scm_world.cli import console, options
 from scm_world.cli.options import load_system, parse_assignments, parse_outcome, tag
-from scm_world.errors import EngineError, ScmWorldError, UnknownOption, UnreadableFile
+from scm_world.errors import ScmWorldError, UnknownOption, UnreadableFile
 from scm_world.runs.canvas import png
 from scm_world.runs.files import write_whole
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from scm_world.backends import Backend
     from scm_world.graph import SCM
     from scm_world.queries.differences import Consequences
     from scm_world.tasks import WorldSource
@@ -167,17 +170,18 @@ def variables(task: options.System, *, option: options.Pairs = None, all_: bool 
 def list_(*, zoo: bool = False) -> None:
     """List tasks, backends, presets, learners, protocols, environments and trained policies.
 
+    What an installed package declares is listed with its name, and with its error if it fails.
     Example: scm-world list --zoo
 
     Args:
         zoo: List the trained policies of the package instead.
     """
-    from scm_world.backends import backends, make_backend
+    from scm_world.backends import known
     from scm_world.discovery.learners import Learner, learners
     from scm_world.env import IDS
     from scm_world.evaluation import protocols_of
     from scm_world.policies import zoo as policies
-    from scm_world.tasks import CONVENTIONS, TASKS
+    from scm_world.tasks import CONVENTIONS, models, tasks
     from scm_world.tasks.families import FAMILIES, PHYSICS
     from scm_world.tasks.trifinger.entities.robot import ACTIONS
     from scm_world.tasks.trifinger.hardware import PRESETS
@@ -197,12 +201,13 @@ def list_(*, zoo: bool = False) -> None:
         console.frame(rows, title="trained policies")
         return
 
-    def version_of(backend: str) -> str:
-        try:
-            with closing(make_backend(backend)) as made:
-                return f"available, version {made.version}"
-        except EngineError as error:
-            return f"not available: {error}"
+    def version_of(make: Callable[[], Backend]) -> str:
+        with closing(make()) as made:
+            return f"available, version {made.version}"
+
+    def first_line(made: Any) -> str:
+        said = made.__doc__ if hasattr(made, "__name__") else repr(made)[:60]
+        return (said or "").strip().partition("\n")[0]
 
     def said_of(learner: Learner) -> str:
         needs = "" if learner.is_installed else f"; needs the extra {learner.extra!r}"
@@ -213,12 +218,13 @@ def list_(*, zoo: bool = False) -> None:
     protocols |= {p.name: p.doc for p in protocols_of("pushing")}
     families = {**{name: family.doc for name, family in FAMILIES.items()}, **PHYSICS}
     sections: dict[str, dict[str, str]] = {
-        "tasks": {n: (made.__doc__ or "").strip().partition("\n")[0] for n, made in TASKS.items()},
-        "backends": {name: version_of(name) for name in backends()},
+        "tasks": tasks().described(first_line),
+        "models": models().described(first_line),
+        "backends": known().described(version_of),
         "presets": {p.name: f"physics steps of {1000 * p.timestep:g} ms" for p in PRESETS.values()},
         "action modes": {name: unit for name, (unit, _) in ACTIONS.items()},
         "conventions": dict.fromkeys(CONVENTIONS, ""),
-        "learners": {name: said_of(one) for name, one in learners().items()},
+        "learners": learners().described(said_of),
         "protocols": protocols,
         "trained policies": {
             name: ": ".join(filter(None, (one.task, scores)))

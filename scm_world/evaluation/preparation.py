@@ -33,7 +33,7 @@ from scm_world.policies.cards import ANY, COMMON, FORM, FREE, as_json, contradic
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import FORMAT, Plan
 from scm_world.tasks import AnySource, Task, make_task, tasks
-from scm_world.tasks.sources import is_model, refuse_untrusted
+from scm_world.tasks.sources import is_named, refuse_untrusted
 from scm_world.variables import Draw, Intervention
 
 _MINE = ("task", "backend", "render_mode")
@@ -251,7 +251,7 @@ def again(
         if task is None:
             task = text = str(about["task"])
             refuse_untrusted(text, None if evaluation.policies else trusted)
-            if text not in tasks() and not is_model(text) and ":" not in text:
+            if not is_named(text):
                 raise UnknownOption("task", text, (*tasks(), "one of your own, if given: task="))
             if about["arguments"]:
                 options["task_options"] = about["arguments"]

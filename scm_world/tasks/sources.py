@@ -16,7 +16,8 @@ from types import MappingProxyType
 from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 from scm_world._arguments import enter, takes, typed
-from scm_world.errors import FunctionFailure, UnknownOption, UnreadableFile, blamed
+from scm_world._plugins import Plugins
+from scm_world.errors import FunctionFailure, ModelError, UnknownOption, UnreadableFile, blamed
 from scm_world.graph import SCM, from_json
 from scm_world.models import Model
 from scm_world.runs.files import read_text
@@ -75,7 +76,8 @@ def register(kind: Kind) -> Kind:
     """Register a custom task by its ``name``, for every place that takes the name of a task.
 
     It can decorate the class. New processes know it if the module that
-    registers it is imported there: put it at the top level of that module.
+    registers it is imported there: put it at the top level of that module. What an installed
+    package declares as an entry point of the group ``scm_world.tasks`` is known everywhere.
 
     Args:
         kind: A class that passes ``scm_world.testing.task.TaskConformance``; every argument of it
@@ -103,9 +105,38 @@ def register(kind: Kind) -> Kind:
     return kind
 
 
-def tasks() -> dict[str, type[Task]]:
-    """Return all tasks that ``make_task`` knows: of this package, then those registered."""
-    return {**TASKS, **_REGISTERED}
+def tasks() -> Plugins[type[Task]]:
+    """Return all tasks that ``make_task`` knows: of this package, then the others."""
+
+    def declared(name: str, found: Any) -> type[Task]:
+        kind: type[Task] = register(found)
+        if kind.name != name:
+            raise ModelError([f"the name of {kind.__name__} is {kind.name!r}, not {name!r}"])
+        return kind
+
+    return Plugins("tasks", {**TASKS, **_REGISTERED}, declared)
+
+
+def models() -> Plugins[Any]:
+    """Return the models that installed packages declare: sources of other kinds than a name.
+
+    Entry points of the group ``scm_world.models`` are files, texts, functions or causal models,
+    as ``read_source`` takes them.
+    """
+
+    def declared(name: str, found: Any) -> Any:
+        if _is_saved(found):
+            return partial(_saved, os.fspath(found))
+        if not (callable(found) or _is_physical(found) or _causal(found) is not None):
+            raise UnknownOption(f"model {name!r}", found, ("a file, a text, a function or an SCM",))
+        return found
+
+    return Plugins("models", {}, declared)
+
+
+def is_named(source: str) -> bool:
+    """Return whether a text names a task or a model, or may be a file or ``"module:name"``."""
+    return source in tasks() or source in models() or is_model(source) or ":" in source
 
 
 class WorldSource(NamedTuple):
@@ -157,6 +188,7 @@ def read_source(
         source: One of
 
             - the name of a task (``tasks()``), a task, its class, or a function that returns one;
+            - the name of a model that an installed package declares (``models()``);
             - a model: the path of an MJCF or URDF file, its text, a ``mujoco.MjSpec``, a
               ``mujoco.MjModel`` or a ``Model``;
             - a step function, which takes four arguments;
@@ -231,7 +263,9 @@ def _named(name: str) -> Any:
         return partial(_saved, name)
     if ":" in name:
         return load_named(name, "task")
-    raise UnknownOption("task", name, (*known, *NAMES))
+    if name in (more := models()):
+        return more[name]
+    raise UnknownOption("task", name, (*known, *more, *NAMES))
 
 
 def _is_saved(source: object) -> bool:
@@ -242,6 +276,8 @@ def _is_saved(source: object) -> bool:
 def is_causal(source: object) -> bool:
     """Return whether something is, or is the name of, a causal model that is made already."""
     if isinstance(source, str) and not is_model(source) and source not in tasks():
+        if source in models():
+            return _causal(models()[source]) is not None
         if ":" in source and not (is_family(source) or _is_saved(source)):
             source = load_named(source, "task")
         else:

@@ -15,13 +15,13 @@ from scm_world.env.observer import EVERY, context_of
 from scm_world.errors import ScmWorldError, UnknownOption
 from scm_world.evaluation.episodes import METRICS
 from scm_world.tasks import TASKS, Task, tasks
-from scm_world.tasks.sources import FILES, is_model
+from scm_world.tasks.sources import FILES, is_named
 from scm_world.variables.spaces import Frozen
 
 
 def known_task(task: str) -> str:
     """Check that a text is the name of a task, or may be a file or ``"module:function"``."""
-    if task not in tasks() and not is_model(task) and ":" not in task:
+    if not is_named(task):
         raise UnknownOption("task", task, (*tasks(), *(f"file{end}" for end in FILES), "module:f"))
     return task
 

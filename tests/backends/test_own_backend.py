@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import sys
-from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -142,15 +141,3 @@ def test_the_example_moves_more_slowly(registry: dict[str, type[Backend]]) -> No
     slow.restore(kept)
     play(slow, 1)
     assert np.array_equal(play(slow, 5), once)
-
-
-def test_installed_packages_declare_backends(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An entry point makes a name known before any module of its package is imported."""
-    entry = EntryPoint("declared", f"{__name__}:Twin", "scm_world.backends")
-    monkeypatch.setattr("scm_world.backends._declared", lambda: {"declared": entry})
-    assert backends()[-1] == "declared"
-    assert isinstance(make_backend("declared"), Twin)
-    wrong = EntryPoint("wrong", "math:pi", "scm_world.backends")
-    monkeypatch.setattr("scm_world.backends._declared", lambda: {"wrong": wrong})
-    with pytest.raises(ModelError, match=r"'wrong'.* does not make a Backend"):
-        make_backend("wrong")

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._arguments import one_of, typed, whole_number
+from scm_world._plugins import Plugins
 from scm_world.discovery.data.dataset import Dataset, block
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.errors import MissingExtra, ModelError, UnknownOption, blamed
@@ -90,6 +91,9 @@ _KNOWN: dict[str, Learner] = {}
 def register(learner: Learner) -> Learner:
     """Make a learner known by its name.
 
+    What an installed package declares as an entry point of the group ``scm_world.learners``, a
+    ``Learner`` or a function, is known everywhere by the name of the entry point.
+
     Raises:
         UnknownOption: Another one has this name.
     """
@@ -100,21 +104,30 @@ def register(learner: Learner) -> Learner:
     return learner
 
 
-def learners() -> Mapping[str, Learner]:
+def learners() -> Plugins[Learner]:
     """Return all learners that are known, by name."""
     import_module(f"{__package__}.known")
-    return dict(_KNOWN)
+    return Plugins("learners", dict(_KNOWN), lambda name, f: replace(_made(name, f), name=name))
+
+
+def _made(name: str, found: Any) -> Learner:
+    """Return a learner, or that of a function, which is called ``name``."""
+    if not (isinstance(found, Learner) or callable(found)):
+        raise UnknownOption("learner", name, ("a Learner or a function",))
+    return found if isinstance(found, Learner) else Learner(name, found)
 
 
 def baselines() -> tuple[str, ...]:
     """Return the names of the trivial learners that belong beside every score.
+
+    Those of other packages are baselines if they are registered.
 
     Example:
         >>> baselines()
         ('empty', 'complete', 'bipartite', 'roles', 'all_or_nothing', 'correlation',
          'sort_regress')
     """
-    return tuple(name for name, known in learners().items() if known.baseline)
+    return tuple(name for name, known in learners().known.items() if known.baseline)
 
 
 @typed
@@ -135,12 +148,7 @@ def learner(name: str) -> Learner:
         if name not in known:
             raise UnknownOption("learner", name, (*known, "module:attribute", "file.py:attribute"))
         return known[name]
-    found = load_named(name, "learner")
-    if isinstance(found, Learner):
-        return found
-    if not callable(found):
-        raise UnknownOption("learner", name, ("a Learner or a function",))
-    return Learner(name, found)
+    return _made(name, load_named(name, "learner"))
 
 
 @typed
