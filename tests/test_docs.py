@@ -28,9 +28,11 @@ PROGRAMS = [path for path in DOCUMENTS if BLOCK.search(path.read_text())]
 
 @pytest.fixture(autouse=True)
 def _kinds() -> Iterator[None]:
-    """Forget the kinds that a page declares: those of other tests may have their names."""
+    """Forget the kinds that a page declares, whose names other tests may use; close figures."""
     before = [(one.kinds, dict(one.kinds)) for one in (Intervention, Variable)]
     yield
+    if "matplotlib.pyplot" in sys.modules:
+        sys.modules["matplotlib.pyplot"].close("all")
     for known, kept in before:
         known.clear()
         known.update(kept)
@@ -53,6 +55,26 @@ def test_python_in_documents_runs(path: Path, capsys: pytest.CaptureFixture[str]
             assert printed == found[2]
     if missing is not None:
         pytest.skip(missing)
+
+
+NOTEBOOKS = ROOT / "docs" / "notebooks"
+
+
+@pytest.mark.parametrize("path", sorted(NOTEBOOKS.glob("*.ipynb")), ids=lambda path: path.stem)
+def test_the_page_of_a_notebook_has_its_cells(path: Path) -> None:
+    """The page has all cells in their order, which run above; the file for Colab, too."""
+    build = runpy.run_path(str(NOTEBOOKS / "build.py"))
+    text, page = path.with_suffix(".py").read_text(), path.with_suffix(".md").read_text()
+    found = build["cells"](text)
+    assert [body for is_text, body in found if not is_text] == [
+        code[1].rstrip("\n") for code in BLOCK.finditer(page)
+    ]
+    words = [body.removeprefix(page.partition("\n")[0]) for is_text, body in found if is_text]
+    places = [page.find(body) for body in words]
+    assert -1 not in places
+    assert places == sorted(places)
+    assert path.read_text() == build["notebook"](text)
+    assert text.count("plt.subplots(") == page.count(f"](../images/notebooks/{path.stem}-")
 
 
 CONSOLE = re.compile(r"^```console\n(.*?)^```$", re.DOTALL | re.MULTILINE)

@@ -11,6 +11,7 @@ from typer.core import TyperGroup
 from scm_world.cli import console, suites
 from scm_world.cli import lab as labs
 from scm_world.cli.data import collect, discover, sweep, triplets, verify
+from scm_world.cli.demo import demo
 from scm_world.cli.options import command
 from scm_world.cli.policies import clone, evaluate, explain, infer, train
 from scm_world.cli.systems import (
@@ -85,7 +86,7 @@ def root(
 
 COMMANDS: tuple[Callable[..., None], ...] = (
     *(discover, verify, check, graph, variables, do, effect, counterfactual, fit),
-    *(collect, sweep, triplets, evaluate, explain, infer, train, clone, studio, list_),
+    *(demo, collect, sweep, triplets, evaluate, explain, infer, train, clone, studio, list_),
 )
 GROUPS: Mapping[typer.Typer, tuple[Callable[..., None], ...]] = {
     app: COMMANDS,

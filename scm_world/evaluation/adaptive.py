@@ -157,6 +157,15 @@ class Adaptive:
         self._commands.append(np.array(env.actions.command(action)))
         return action
 
+    @property
+    def unseen(self) -> frozenset[str]:
+        """The variables whose true values never reach the policy."""
+        return frozenset(self._hidden)
+
+    def hidden(self, observation: Observation) -> Floats:
+        """Return the believed parameters, as ``Agent.hidden`` has them, scaled for the fit."""
+        return self._scaled
+
     def _prepare(self, env: ScmWorldEnv) -> None:
         """Make a world with the declared parameters, in which fits are simulated."""
         if self._env is not None:

@@ -30,6 +30,7 @@ from scm_world.errors import UnknownOption
 from scm_world.evaluation.episodes import Hook, placed, play, under
 from scm_world.evaluation.preparation import prepare
 from scm_world.evaluation.protocols import Protocol
+from scm_world.evaluation.recording import parts
 from scm_world.evaluation.setups import Setup, Shard
 from scm_world.evaluation.statistics.causes import FEWEST, useless
 from scm_world.evaluation.statistics.intervals import LEVEL, Interval, mean_interval
@@ -83,18 +84,24 @@ class _Watch(Hook):
         if UNTRAINED in self._agents:
             self._agents[UNTRAINED].act(observation)
         now = self._env.world.evaluate((*self._env.observer.needed, *self._names))
-        card = self._agents[HIDDEN].card
-        present: Any = self._env.observer.observe(now)
-        if isinstance(present, Mapping):
-            inputs = None if card is None else card.inputs
-            parts = [one for name, one in present.items() if inputs is None or name in inputs]
-            present = np.concatenate([*map(np.ravel, parts)])
-        causes = np.concatenate([np.ravel(now[name]) for name in self._names])
-        found = {OBSERVATION: np.ravel(present), "causes": causes}
+        found = {OBSERVATION: self._shown(parts(self._env.observer.observe(now)))}
+        found["causes"] = np.concatenate([np.ravel(now[name]) for name in self._names])
         states = {name: agent.hidden() for name, agent in self._agents.items()}
         found |= {name: state for name, state in states.items() if state is not None}
         self.kept[self._env.world.index] = {n: v.astype(np.float64) for n, v in found.items()}
         return action
+
+    def _shown(self, present: Mapping[str, Any]) -> Floats:
+        """Return the numbers of the present observation that the agent is shown, the others 0."""
+        agent, shown = self._agents[HIDDEN], []
+        inputs = None if agent.card is None else agent.card.inputs
+        for name, part in present.items():
+            if inputs is None or name in inputs:
+                shown.append(np.array(part, np.float64).ravel())
+                layout = getattr(self._env.observer.parts.get(name or "observation"), "layout", {})
+                for variable in getattr(agent.network, "unseen", ()):
+                    shown[-1][layout.get(variable, slice(0))] = 0.0
+        return np.concatenate(shown)
 
 
 class _Twin(Hook):
@@ -114,6 +121,7 @@ class _Twin(Hook):
             self.own, self.world = np.array(action, np.float64).ravel(), self._env.world.snapshot()
             if self._env.history is not None:
                 self._env.history.rows[:] = 0.0
+            self._agent.forget()
             self._agent.start(self._env)
             emptied = self._agent.act(self._env.observe())
             self.reaction = np.array(emptied, np.float64).ravel()
@@ -151,6 +159,7 @@ class _Runner:
         (protocol,), env = self.setup.protocols.values(), self.env(AGENT)
         agent, where = self.setup.agents[AGENT], {"seed": shard.seed, "episode": episode}
         with placed({"engine": shard.engine, "protocol": protocol.name, **where}, env):
+            agent.forget()
             watch = _Watch(agent, agent.untrained(), self.names)
             play(under(env, protocol), agent, hooks=(watch,), seed=shard.seed, episode=episode)
             end = watch.kept[max(watch.kept)]
@@ -168,12 +177,14 @@ class _Runner:
         row = env.world.evaluate(self.names)
         other = {name: np.array(row[name]) for name in self.names}
         usual = _Twin(agent, end)
+        agent.forget()
         play(under(env, protocol), agent, hooks=(usual,), seed=seed, episode=episode)
         row = env.world.evaluate(self.names)
         was, found = {name: np.array(row[name]) for name in self.names}, []
         for name, value in other.items():
             twin, set_there = _Twin(agent, end), at_step(at, {name: value})
             acting = under(env, Protocol("twin", act=together(act, set_there)))
+            agent.forget()
             play(acting, agent, hooks=(twin,), seed=seed, episode=episode)
             one = {"own": twin.own - usual.own, "reaction": twin.reaction - usual.reaction}
             one["sign"] = np.sign(np.sum(value - was[name]))[None]
@@ -408,8 +419,8 @@ def _drawing(variables: Any) -> Protocol:
     """Return the protocol that draws variables."""
     if not isinstance(variables, Mapping):
         return Protocol("drawn", as_names(variables), "A")
-    parts = [resample(name, space=space) for name, space in variables.items()]
-    return Protocol("drawn", act=together(*parts) if parts else None)
+    draws = [resample(name, space=space) for name, space in variables.items()]
+    return Protocol("drawn", act=together(*draws) if draws else None)
 
 
 def _played(

@@ -90,19 +90,22 @@ class Change:
 
     @property
     def verdict(self) -> str:
-        """Whether the action follows the cause: ``"change"``, or ``"no change"``.
+        """``"change"``, or ``"no change"`` where the interval contains what random signs give.
 
-        There is no change where the interval of the effect contains numbers that random signs
-        give, too.
+        That is their mean; or the effect lies among their 95 %.
         """
-        return "change" if self.effect.low > self.shuffled.high else "no change"
+        return "change" if _exceeds(self.effect, self.shuffled) else "no change"
 
     @property
     def agrees(self) -> bool | None:
         """Whether it has the direction of the privileged agent's; None where that is not known."""
         if self.agreement is None or self.flipped is None:
             return None
-        return self.agreement.low > self.flipped.high
+        return _exceeds(self.agreement, self.flipped)
+
+
+def _exceeds(found: Interval, chance: Interval) -> bool:
+    return found.low > chance.value and found.value > chance.high
 
 
 @final

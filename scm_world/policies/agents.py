@@ -191,7 +191,7 @@ class Agent:
         Raises:
             FunctionFailure: The method of the policy raised an error.
         """
-        ask = getattr(self._act, "hidden", None)
+        ask = getattr(self._act, "hidden", None) or getattr(self.network, "hidden", None)
         if not callable(ask) or self._seen is None:
             return None
         with blamed(f"the policy {self.about['name']!r}"):
@@ -502,7 +502,7 @@ def _of_object(policy: Any, about: About) -> Agent:
     if isinstance(made, MlpPolicy):
         return _of_network(made, {**about, "sha256": made.sha256}, policy)
     if hasattr(made, "start") and hasattr(made, "act"):
-        how: Any = {"card": getattr(made, "card", None), "remembers": True}
+        how: Any = {"card": getattr(made, "card", None), "network": made, "remembers": True}
         return Agent({**about, "sees": "world"}, partial(_started, made), policy, **how)
     if not hasattr(made, "predict"):
         return Agent(about, partial(_function, made), policy, network=made)

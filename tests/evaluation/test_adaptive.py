@@ -12,7 +12,7 @@ from adaptation_samples import FORM, MASS, MEASURES, TOLD, Cart, Shaking, adapti
 
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import NotIntervenable, UnknownOption, UnknownVariable
-from scm_world.evaluation import Adaptive, evaluate, play
+from scm_world.evaluation import Adaptive, evaluate, inferred, play
 from scm_world.policies import as_agent
 from scm_world.policies.planning import CrossEntropy
 
@@ -209,3 +209,13 @@ def test_what_cannot_be_fitted_or_shown_is_refused() -> None:
     for wrong in ({"after": 0}, {"every": 0}, {"iterations": 0}, {"last": 1}, {"use": "mode"}):
         with pytest.raises(UnknownOption):
             Adaptive(TOLD, MASS, measures=MEASURES, **wrong)
+
+
+def test_what_it_believes_is_its_hidden_state() -> None:
+    """The fitted mass; the true one, which is observed but not told to it, is no control."""
+    agent = Adaptive(TOLD, MASS, after=15, measures=MEASURES)
+    env = {"max_episode_length": 18}
+    first, end = inferred(agent, MASS, task=Cart(), steps=(0,), at=0, n=12, env=env).probes
+    assert first.verdict == "no"
+    assert first.scores["observation"]["linear"].value < 0.5
+    assert end.scores["hidden"]["linear"].low > 0.9

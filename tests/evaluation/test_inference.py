@@ -235,6 +235,26 @@ def test_a_memory_is_part_of_the_hidden_state(kind: str) -> None:
     assert as_agent("still").hidden() is None
 
 
+def test_what_is_kept_from_other_episodes_does_not_count() -> None:
+    """An agent that keeps its estimate forgets it before each episode, and for the reaction."""
+
+    class Keeper(Learner):
+        def __init__(self) -> None:
+            self.forget()
+
+        def forget(self) -> None:
+            super().reset()
+
+        def reset(self) -> None:
+            self.last = None
+
+    one, other = (
+        inferred(agent, "mass", task=Cart(), steps=(3,), **{**HOW, "n": 12})
+        for agent in (Keeper(), Learner())
+    )
+    assert (one.probes, one.changes) == (other.probes, other.changes)
+
+
 def test_the_memory_of_a_model_is_its_hidden_state() -> None:
     """As recurrent models of Stable-Baselines3 have it: output and cell, each (layers, n, size)."""
 
