@@ -18,7 +18,7 @@ import pandas
 from numba import njit
 
 from scm_world import Box, ModelTask
-from scm_world.evaluation import Protocol, evaluate, inferred
+from scm_world.evaluation import Adaptive, Protocol, evaluate, inferred
 from scm_world.evaluation.results import Evaluation
 
 HERE = Path(__file__).resolve()
@@ -37,8 +37,7 @@ class Cart(ModelTask):
     start = {"slider.position": Box(-0.5, 0.5)}  # noqa: RUF012
     spaces = {  # noqa: RUF012
         "cart.external_force": {"a": Box((-4, 0, 0), (4, 0, 0)), "b": Box((4, 0, 0), (6, 0, 0))},
-        "cart.mass": {"a": Box(0.7, 1.5), "b": Box(1.5, 3.0)},
-        "motor.gear": {"a": Box(8, 12), "b": Box(7, 8)},
+        "motor.gear": {"a": Box(8, 12), "b": Box(12, 20)},
     }
     reward = (njit(lambda x, v: -abs(x) - 0.05 * abs(v)), "slider.position", "slider.velocity")
 
@@ -95,9 +94,14 @@ class Reacher(ModelTask):
 
 TASKS: dict[str, type[ModelTask]] = {"cart": Cart, "puck": Puck, "reacher": Reacher}
 CAUSES = {
-    "cart": {"push": "cart.external_force", "mass": "cart.mass", "gear": "motor.gear"},
+    "cart": {"push": "cart.external_force", "gear": "motor.gear"},
     "puck": {"mass": "puck.mass", "friction": "slide.frictionloss"},
     "reacher": {"gear": "*.gear", "delay": "*.control_delay"},
+}
+MEASURES = {  # by the agent that fits: the noise of its sensors, or what it takes for noise
+    "cart": {"slider.position_reading": 0.03, "slider.velocity_reading": 0.3},
+    "puck": {"slide.position_reading": 0.005, "rail.position": 0.001},
+    "reacher": {"shoulder.position": 0.001, "elbow.position": 0.001},
 }
 PAST = 5  # control steps that the agents with a history observe
 LEARNS: dict[str, dict[str, Any]] = {
@@ -146,11 +150,17 @@ def trained(task: str, agent: str, seed: int, steps: int, folder: Path) -> Path:
     return out / "policy.safetensors"
 
 
-def fitting(task: str, policy: Path) -> Any:
+def fitting(task: str, policy: Path) -> Adaptive:
     """Return an agent that fits the causes to its episode, and acts as if it saw them."""
-    from scm_world.policies import Adaptive
-
-    return Adaptive(str(policy), [*CAUSES[task].values()], after=15, every=15)
+    causes = [*CAUSES[task].values()]
+    how: dict[str, Any] = {
+        "after": 10,
+        "every": 30,
+        "prior": "A",
+        "iterations": 15,
+        "measures": MEASURES[task],
+    }
+    return Adaptive(str(policy), causes, **how)
 
 
 def study(task: str, seeds: int, steps: int, episodes: int, folder: Path) -> Evaluation:
