@@ -78,7 +78,7 @@ class Plugins(Mapping[str, Made]):
     def described(self, describe: Callable[[Made], str]) -> dict[str, str]:
         """Return a sentence about each entry: what is wrong with it, if it cannot be loaded."""
         found, known = dict[str, str](), {*self.known}
-        for name in [*self]:
+        for name in self:
             try:
                 found[name] = describe(self[name])
             except (ModelError, EngineError, MissingExtra) as error:

@@ -57,6 +57,21 @@ def test_python_in_documents_runs(path: Path, capsys: pytest.CaptureFixture[str]
         pytest.skip(missing)
 
 
+QUESTION = re.compile(r"^\| [^|]+\? \| `([^`]+)` \| \[", re.MULTILINE)
+
+
+def test_calls_of_the_page_of_questions_run() -> None:
+    """Each call of a row runs with the names of the page's program."""
+    text = (ROOT / "docs" / "questions.md").read_text()
+    names: dict[str, object] = {"__name__": "document"}
+    for found in BLOCK.finditer(text):
+        exec(found[1], names)  # noqa: S102 # our own text
+    calls = QUESTION.findall(text)
+    assert len(calls) == text.count("? | ") > 30
+    for call in calls:
+        assert eval(call, names) is not None, call  # noqa: S307 # our own text
+
+
 NOTEBOOKS = ROOT / "docs" / "notebooks"
 
 
@@ -69,8 +84,7 @@ def test_the_page_of_a_notebook_has_its_cells(path: Path) -> None:
     assert [body for is_text, body in found if not is_text] == [
         code[1].rstrip("\n") for code in BLOCK.finditer(page)
     ]
-    words = [body.removeprefix(page.partition("\n")[0]) for is_text, body in found if is_text]
-    places = [page.find(body) for body in words]
+    places = [page.find(body) for is_text, body in found if is_text]
     assert -1 not in places
     assert places == sorted(places)
     assert path.read_text() == build["notebook"](text)
@@ -121,6 +135,20 @@ def test_every_page_is_in_the_navigation_once() -> None:
     named = re.findall(r"(\S+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
     pages = (ROOT / "docs").rglob("*.md")
     assert sorted(named) == sorted(str(path.relative_to(ROOT / "docs")) for path in pages)
+
+
+def test_texts_for_language_models_have_every_page_and_no_dead_link() -> None:
+    """``llms.txt`` lists each page with a sentence; links of both files lead to files."""
+    made = runpy.run_path(str(ROOT / ".ci" / "llms.py"))
+    short, whole = made["texts"](made["pages"]())
+    listed = re.findall(r"^- \[[^\]]+\]\((\S+)\): (?=[A-Z`]).+$", short, re.MULTILINE)
+    pages = [path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")]
+    assert sorted(listed) == sorted(pages)
+    links = re.findall(r"\]\(([^)#]+)[^)]*\)|src=\"([^\"]+)\"", short + whole)
+    inner = {one or other for one, other in links if "://" not in one + other}
+    assert len(inner) > len(pages)
+    assert [one for one in inner if not (ROOT / "docs" / one).exists()] == []
+    assert not re.search(r"^--8<--|^:::", whole, re.MULTILINE)
 
 
 def test_modules_of_the_reference_exist() -> None:

@@ -4,7 +4,8 @@
 
     python -m benchmarks.speed                    # all of it, a quarter of an hour on one core
     python -m benchmarks.speed --only step,batch  # some of it; the other figures stay
-    python -m benchmarks.speed --quick --out DIR  # everything in a minute; the figures are rough
+    python -m benchmarks.speed --quick            # everything in two minutes, rough, elsewhere
+    python -m benchmarks.speed --quick --record   # and a line of benchmarks/history.jsonl
 
 It stays on one core (but where threads and workers are compared), writes ``results.json`` and
 ``speed.png``, and tables of goals and of the predecessor into ``docs/benchmarks/speed.md``. Sides
@@ -19,6 +20,7 @@ import importlib.metadata
 import json
 import os
 import platform
+import tempfile
 import time
 import traceback
 from collections.abc import Callable
@@ -26,6 +28,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import as_json
+from benchmarks.speed import history
 from benchmarks.speed.adapter import adapting
 from benchmarks.speed.batches import batching
 from benchmarks.speed.changing import changing, making
@@ -69,18 +72,25 @@ def arguments(given: list[str] | None = None) -> argparse.Namespace:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--only", help=f"some of {','.join(SECTIONS)}")
-    parser.add_argument("--quick", action="store_true", help="rough figures in a minute")
+    parser.add_argument("--quick", action="store_true", help="rough figures in two minutes")
+    parser.add_argument("--record", action="store_true", help="add them to the history")
     parser.add_argument("--predecessor", metavar="PYTHON", help="interpreter that has CausalWorld")
     parser.add_argument("--no-predecessor", action="store_true", help="leave it out")
     parser.add_argument("--sb3", metavar="PYTHON", help="interpreter with Stable-Baselines3")
     parser.add_argument("--core", type=int, help="the core to stay on; the last one by default")
-    parser.add_argument("--out", type=Path, default=HERE, help="folder of the results")
+    parser.add_argument("--out", type=Path, help="folder of the results; a new one if quick")
     parser.add_argument("--page", type=Path, help="the page with the tables")
     found = parser.parse_args(given)
     found.only = tuple(SECTIONS) if found.only is None else tuple(found.only.split(","))
     unknown = set(found.only) - SECTIONS.keys()
     if unknown:
         parser.error(f"there is no {min(unknown)!r}; there are {', '.join(SECTIONS)}")
+    if found.out is None:
+        found.out = Path(tempfile.mkdtemp(prefix="speed-")) if found.quick else HERE
+    load = os.getloadavg()[0] / (os.cpu_count() or 1)
+    if found.record and load > history.BUSY:
+        most = f"{history.BUSY:g} a core are the most that is recorded"
+        parser.error(f"other programs run: the load is {load:.2f} a core, {most}")
     if found.page is None and found.out == HERE:
         found.page = DOCS / "benchmarks" / "speed.md"
     return found
@@ -139,11 +149,16 @@ def main(given: list[str] | None = None) -> None:
         document = json.loads(path.read_text(encoding="utf-8"))
     document["about"] = about()
     core = max(os.sched_getaffinity(0)) if asked.core is None else asked.core
-    broken = []
+    before, broken = {**document["results"]}, []
     for name in asked.only:
         if not measured(name, settings, core, document):
             broken.append(name)
         write_whole(path, (as_json(document) + "\n").encode())
+    if asked.record:
+        now = {n: found for n, found in document["results"].items() if found is not before.get(n)}
+        path = HERE.parent / "history.jsonl"
+        rows = history.record(document["about"], now, quick=asked.quick, path=path)
+        history.publish(rows, DOCS / "benchmarks" / "speed.md", DOCS / "images" / "history.png")
     draw(document["results"], (DOCS / "images" if asked.out == HERE else asked.out) / "speed.png")
     if asked.page is not None:
         put(page(document), asked.page)

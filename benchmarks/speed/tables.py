@@ -65,6 +65,11 @@ SECTIONS: dict[str, tuple[Callable[[Figures], list[str]], str]] = {
 }
 
 
+def machine(about: dict[str, Any]) -> str:
+    """Name the kind of machine."""
+    return f"{about['processor']}, {about['cores']} cores, {about['system']}"
+
+
 def page(document: dict[str, Any]) -> str:
     """Write the tables.
 
@@ -73,8 +78,7 @@ def page(document: dict[str, Any]) -> str:
     """
     about, results = document["about"], document["results"]
     packages = ", ".join(f"{name} {version}" for name, version in about["versions"].items())
-    machine = f"{about['processor']}, {about['cores']} cores, {about['system']}"
-    lines = [f"Measured on {machine}; {packages}.", ""]
+    lines = [f"Measured on {machine(about)}; {packages}.", ""]
     for title, (write, words) in SECTIONS.items():
         written = write(results)
         if written:
@@ -82,15 +86,16 @@ def page(document: dict[str, Any]) -> str:
     return "\n".join(lines).rstrip()
 
 
-def put(text: str, into: Path) -> None:
-    """Replace what stands between the marks of a page.
+def put(text: str, into: Path, mark: str = "speed") -> None:
+    """Replace what stands between two marks of a page.
 
     Raises:
         ValueError: The page has no marks.
     """
     whole = into.read_text(encoding="utf-8")
-    before, found, rest_of_it = whole.partition(BEGIN)
-    _, closed, after = rest_of_it.partition(END)
+    begin, end = (line.replace("speed", mark) for line in (BEGIN, END))
+    before, found, rest_of_it = whole.partition(begin)
+    _, closed, after = rest_of_it.partition(end)
     if not (found and closed):
-        raise ValueError(f"{into} needs the lines {BEGIN} and {END}")
-    into.write_text(f"{before}{BEGIN}\n\n{text}\n\n{END}{after}", encoding="utf-8")
+        raise ValueError(f"{into} needs the lines {begin} and {end}")
+    into.write_text(f"{before}{begin}\n\n{text}\n\n{end}{after}", encoding="utf-8")

@@ -54,7 +54,7 @@ def page(path: Path) -> str:
     folder, names = HERE.parent / "images" / "notebooks", {"__name__": "document"}
     folder.mkdir(parents=True, exist_ok=True)
     address = f"{COLAB}/github/{REPOSITORY}/blob/main/docs/notebooks/{path.stem}.ipynb"
-    badge = f"[![Open in Colab]({COLAB}/assets/colab-badge.svg)]({address})"
+    button = f"[Open in Colab]({address}){{ .md-button }}"
     parts: list[str] = []
     drawn = 0
     for is_text, body in cells(path.read_text()):
@@ -72,10 +72,8 @@ def page(path: Path) -> str:
             figure.savefig(folder / name, dpi=80, metadata={"Software": None})
             parts.append(f"![{figure.get_label()}](../images/notebooks/{name})")
         plt.close("all")
-    heading, _, rest = parts[0].partition("\n")
     command = "This page is written by `python docs/notebooks/build.py`, with outputs of a run."
-    parts[0] = f"{heading}\n\n{badge}\n{rest}"
-    return "\n\n".join([*parts, command]) + "\n"
+    return "\n\n".join([parts[0], button, *parts[1:], command]) + "\n"
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ PENDULUM = """
 </mujoco>
 """
 
-world = sw.World(PENDULUM)
+world = sw.World(PENDULUM, expose=["*", "*.scale"])
 print(len(world.model), "variables,", len(world.graph.edges), "edges")
 print("causes of the velocity:", *sorted(world.graph.parents("hinge.velocity")))
 
@@ -40,11 +40,11 @@ axes.axis("off")
 # %% [markdown]
 # ## Intervene
 #
-# `do` sets a variable at one instant, and reports the consequences at the same instant. A heavier pole
-# of the same shape has a larger inertia.
+# `do` sets a variable at one instant, and reports the consequences at the same instant. `pole.scale`, which `expose`
+# adds, is a factor from which mass and inertia follow.
 
 # %%
-print(world.do({"pole.mass": 0.4}))
+print(world.do({"pole.scale": 2.0}))
 
 # %% [markdown]
 # ## Observe, and imagine

@@ -7,6 +7,8 @@ import numpy as np
 from scm_world import Box, ModelTask
 from scm_world.discovery.data import Dataset
 
+__version__ = "0.1.0"  # results name it
+
 ROD = """<mujoco model="rod"><worldbody><body name="rod"><joint name="hinge" axis="0 1 0"/>
   <geom type="capsule" fromto="0 0 0 0 0 -.5" size=".02" mass=".1"/></body></worldbody>
   <actuator><motor name="push" joint="hinge" ctrlrange="-1 1"/></actuator></mujoco>"""

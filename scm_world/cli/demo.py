@@ -7,24 +7,21 @@ import webbrowser
 from base64 import b64encode
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.live import Live
 from rich.text import Text
 
 import scm_world as sw
 from scm_world.cli import console
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
 LINES = """\
 import scm_world as sw
 episode = sw.World("picking").rollout("feedback", seed=0, steps=90)
 twin = episode.counterfactual({"tool_block.mass": 0.3})"""
-SECONDS = 4.0
-"""How long the picture moves on a terminal."""
+SECONDS = 4.0  # how long the picture moves on a terminal
 PAGE = """<!doctype html><meta charset="utf-8"><title>scm_world: a world and its twin</title>
 <body style="font: 16px sans-serif; max-width: 720px; margin: 2em auto">
 <p>{said}</p><img width="720" alt="Left the world, right its twin"><pre>{lines}</pre><script>
@@ -67,17 +64,16 @@ def demo(*, page: bool = False) -> None:
         webbrowser.open((folder / "demo.html").absolute().as_uri())
     elif screen.is_terminal and screen.color_system:
         side = max(8, min(44, screen.width // 2, 2 * (screen.height - 8)))
-        begin = time.monotonic()
+        end = time.monotonic() + SECONDS
         with Live(console=screen, auto_refresh=False) as live:
-            while (share := (time.monotonic() - begin) / SECONDS) < 1.0:
-                live.update(_drawn(pixels(int(91 * share), (side - side % 2, side))), refresh=True)
+            while (left := (end - time.monotonic()) / SECONDS) > 0.0:
+                step = int(91 * (1.0 - left))
+                live.update(_drawn(pixels(step, (side - side % 2, side))), refresh=True)
     else:
         rows = {"step": range(0, 91, 15), "rises [cm]": rises[0][::15], "twin [cm]": rises[1][::15]}
         console.frame(rows)
-    console.say(
-        "It rises by {} cm, in the twin by {} cm. In Python:".format(*(h[-1] for h in rises))
-    )
-    console.say("", LINES)
+    ends = [rise[-1] for rise in rises]
+    console.say(f"It rises by {ends[0]} cm, in the twin by {ends[1]} cm. In Python:", "", LINES)
 
 
 def _drawn(rgb: NDArray[np.uint8]) -> Text:

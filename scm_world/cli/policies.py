@@ -291,7 +291,7 @@ def evaluate(
             agents, protocols, backend=backend or made.backend, **how, **job
         )
     metric = found.metric(metric)
-    files = *found.save(folder), *write_figures(found, folder, metric)
+    files = *found.save(folder), *write_figures(found, folder, metric, reference=reference)
     docs = {one["name"]: one.get("doc", "") for one in found.about["protocols"]}
     engines = found.engines
     rows, gaps, regrets, learned, curves = [], [], [], [], []

@@ -1,4 +1,4 @@
-"""Figures of evaluations: bars, radars and performance profiles.
+"""Figures of evaluations: bars, radars, performance profiles, and figures of adaptation.
 
 Each function returns a matplotlib figure; ``save`` writes it, with the same bytes for the same
 evaluation. matplotlib is loaded when one is drawn. Lines of equal scores lie on one another, so the
@@ -9,27 +9,33 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from itertools import product
 from typing import TYPE_CHECKING, Any, cast, final
 
 import numpy as np
 
+from scm_world._arguments import one_of
+from scm_world._patterns import fits
 from scm_world.errors import UnknownOption
-from scm_world.evaluation.episodes import LAST
-from scm_world.evaluation.results import Evaluation
-from scm_world.evaluation.statistics import Interval, performance_profile
+from scm_world.evaluation.episodes import DRAWN, KEYS, LAST, drawn_columns
+from scm_world.evaluation.results import RATES, Evaluation
+from scm_world.evaluation.statistics import Interval, mean_interval, performance_profile
 from scm_world.runs.canvas import INK, MARKERS, PALETTE, blank, save, styled
 from scm_world.runs.files import Location, located, remove
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.projections.polar import PolarAxes
 
 BAR = 0.16  # [inches] of a bar, and of a line of text
 PAPER = {"fc": "white", "ec": "none", "pad": 0.6}
 HATCHES = ("", "////", "....", "xxxx")
+BINS, FEWEST = 8, 10  # bins of a drawn number at most, and draws in each at least, about
+PANELS, CURVE = 12, 50  # of a figure, and points of a curve, at most
 WIDEST, THINNEST = 4.5, 1.2  # [points] of the first and the last line
 DASHES: Sequence[Any] = ("solid", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)))
 
@@ -303,11 +309,181 @@ def radar_figure(evaluation: Evaluation, metric: str | None = None) -> Figure:
     return figure
 
 
-FIGURES = {"bars": bars_figure, "radar": radar_figure, "profile": profile_figure}
+# --- adaptation -----------------------------------------------------------------------------------
+
+
+def _drawn(evaluation: Evaluation) -> dict[str, list[str]]:
+    """Return the columns that each protocol draws; of a function, also those of the environment."""
+    varies = {one["name"]: one.get("varies") for one in evaluation.about.get("protocols", ())}
+    found = {}
+    for protocol in evaluation.protocols:
+        frame = evaluation.only(protocol=protocol).frame
+        every = {one: name for name, own in drawn_columns(frame).items() for one in own}
+        every = {one: name for one, name in every.items() if frame[one].nunique() > 1}
+        named = [one for one, name in every.items() if fits(name, varies.get(protocol) or ())]
+        found[protocol] = named or [*every]
+    return found
+
+
+def _curve(
+    ax: Axes, look: Mapping[str, Any], gid: str, x: Any, y: Any, low: Any, high: Any
+) -> None:
+    ax.plot(x, y, gid=gid, **look)
+    ax.fill_between(x, low, high, color=look["color"], alpha=0.16, lw=0, gid=f"band {gid}")
+
+
+@styled
+def strength_figure(evaluation: Evaluation, metric: str | None = None) -> Figure:
+    """Draw the mean score by the drawn value of each cause: a panel for each number that is drawn.
+
+    Episodes are binned by that number, ten or more in a bin. They are those of the protocols that
+    draw nothing else; if there is none, of the protocol that draws the fewest others with it, and
+    these numbers come last. Shaded is where the values of protocols with space A and B lie. The
+    first twelve are drawn.
+
+    Raises:
+        UnknownOption: The metric is unknown, or no protocol draws a variable.
+    """
+    chart, drawn, frame = Chart(evaluation, metric), _drawn(evaluation), evaluation.by_draw.frame
+    about = {one["name"]: one for one in evaluation.about.get("protocols", ())}
+    panels: dict[tuple[str, int], list[str]] = {}  # protocols, by column and control step
+    for protocol in sorted(drawn, key=lambda one: len(drawn[one])):
+        for column in drawn[protocol]:
+            mine = panels.setdefault((column, about[protocol]["step"]), [])
+            if not mine or len(drawn[protocol]) == len(drawn[mine[0]]) == 1:
+                mine.append(protocol)
+    if not panels:
+        raise UnknownOption("protocols", evaluation.protocols, ("one that draws a variable",))
+    count = min(len(panels), PANELS)
+    wide, high = min(3, count), math.ceil(count / 3)
+    note = f"Means over bins of a drawn number, with 95 % intervals; {count} of {len(panels)} "
+    note += "numbers. Shaded: drawn from A (light) and from B (dark)."
+    figure = chart.sheet(max(3.2 * wide, 5.0), 2.6 * high, note)
+    axes = figure.subplots(high, wide, squeeze=False, sharey=True)
+    for ax in axes.flat[count:]:
+        ax.remove()
+    for ax, ((column, step), protocols) in zip(axes.flat, panels.items(), strict=False):
+        for space, shade in (("A", 0.06), ("B", 0.14)):
+            of = [one for one in protocols if about[one]["space"] == space]
+            if len(lie := frame[column][frame["protocol"].isin(of)]):
+                ax.axvspan(lie.min(), lie.max(), color=INK, alpha=shade, lw=0, gid=space)
+        units = frame[frame["protocol"].isin(protocols)].groupby([*KEYS[:1], *KEYS[2:]])
+        mean = units[[column, chart.metric]].mean().reset_index()  # over training runs
+        values, draws = np.unique(mean[column]), mean.groupby([*KEYS[3:]]).ngroups
+        parts = np.array_split(values, min(max(draws // FEWEST, 1), BINS, len(values)))
+        mean["bin"] = np.searchsorted([part[0] for part in parts], mean[column], side="right")
+        for (agent, engine), look in chart.lines.items():
+            rows = mean[(mean["agent"] == agent) & (mean["engine"] == engine)]
+            bins = [one for _, one in rows.groupby("bin")]
+            scores = [one[chart.metric].to_numpy() for one in bins]
+            found = [mean_interval(one, proportion=RATES[chart.metric]) for one in scores]
+            ends = np.array([(one.value, one.low, one.high) for one in found]).reshape(-1, 3).T
+            style, gid = {**look, "markersize": 4.0}, f"{agent}|{engine}|{column}|{step}"
+            _curve(ax, style, gid, [one[column].mean() for one in bins], *ends)
+        title = column.removeprefix(DRAWN) + (f" after {step} steps" if step else "")
+        ax.set_title(textwrap.fill(f"{title} ({', '.join(protocols)})", 38), size=8)
+    for ax in axes[:, 0]:
+        ax.set_ylabel(textwrap.fill(chart.metric_words, 34))
+    return figure
+
+
+@styled
+def regret_figure(
+    evaluation: Evaluation, metric: str | None = None, *, reference: str | None = None
+) -> Figure:
+    """Draw the regret to a reference agent: a row for each protocol that varies one variable.
+
+    A column is an agent on a backend, and a cell has the regret with its interval, see
+    ``Evaluation.regret``; bold where the interval does not contain 0. A pattern of names counts as
+    one variable.
+
+    Raises:
+        UnknownOption: The metric or the agent is unknown, or there is no such protocol, no other
+            agent, or a draw that not all have played.
+    """
+    from matplotlib.colors import LinearSegmentedColormap
+    from matplotlib.patches import Patch
+
+    chart, reference = Chart(evaluation, metric), evaluation.the("agent", reference)
+    declared = {one["name"]: one.get("varies") or () for one in evaluation.about["protocols"]}
+    names = [name for name in evaluation.protocols if len(declared[name]) == 1]
+    lines = [line for line in chart.lines if line[0] != reference]
+    if not (names and lines):
+        allowed = ("one with another agent, and with a protocol that varies one variable",)
+        raise UnknownOption("evaluation for regret", evaluation.protocols, allowed)
+    found = [[evaluation.regret(agent, reference, name, chart.metric, engine=engine)
+              for agent, engine in lines] for name in names]  # fmt: skip
+    table = np.array([[one.value for one in row] for row in found])
+    words = (f"{reference} scores lower", f"{reference} scores higher")
+    ends = [Patch(color=c, label=word) for c, word in zip(PALETTE, words, strict=False)]
+    note = f"By how much {reference} scores higher in the same draws, with 95 % intervals."
+    figure = chart.sheet(max(2.8 + 1.2 * len(lines), 5.0), 0.45 * len(names) + 0.5, note, ends)
+    ax = figure.add_subplot()
+    most = 2.0 * (float(np.abs(table).max()) or 1.0)  # pale enough for text
+    colors = LinearSegmentedColormap.from_list("regret", [PALETTE[0], "white", PALETTE[1]])
+    ax.imshow(table, colors, vmin=-most, vmax=most, aspect="auto")
+    ax.set_xticks(
+        range(len(lines)), [textwrap.fill(chart.lines[one]["label"], 16) for one in lines]
+    )
+    texts = ["\n".join((*declared[name], f"{name} {chart.words[name]}")) for name in names]
+    ax.set_yticks(range(len(names)), texts)
+    ax.grid(visible=False)
+    for y, row in enumerate(found):
+        for x, one in enumerate(row):
+            text = str(one).replace(" [", "\n[").replace("-", "−")
+            weight = "bold" if one.excludes(0.0) else "normal"
+            ax.text(x, y, text, ha="center", va="center", size=7, weight=weight)
+    return figure
+
+
+@styled
+def recovery_figure(evaluation: Evaluation, metric: str | None = None) -> Figure:
+    """Draw the mean reward by control step since an intervention within episodes, with bands.
+
+    Each protocol of this kind has a panel; see ``Evaluation.since``. The metric does not matter.
+
+    Raises:
+        UnknownOption: The metric is unknown, no rewards were kept, or no protocol intervenes within
+            episodes.
+    """
+    chart, rewards = Chart(evaluation, metric), evaluation.rewards
+    about = {one["name"]: one["step"] for one in evaluation.about.get("protocols", ())}
+    shown = [name for name in evaluation.protocols if about.get(name)]
+    if rewards is None or not shown:
+        allowed = ("one with steps=True, of a protocol such as P2@100",)
+        raise UnknownOption("evaluation for recovery", evaluation.protocols, allowed)
+    size = math.ceil(rewards.shape[1] / CURVE)
+    chart.metric_words = "reward since an intervention"
+    note = f"Means over {size} control steps of {chart.counted}, with 95 % intervals."
+    figure = chart.sheet(6.2, 2.6 * len(shown), note)
+    for ax, name in zip(figure.subplots(len(shown), squeeze=False)[:, 0], shown, strict=True):
+        for (agent, engine), look in chart.lines.items():
+            if name in evaluation.only(agent=agent, engine=engine).protocols:
+                found = evaluation.since(name, agent=agent, engine=engine, every=size)
+                style = {**look, "markevery": 5, "markersize": 4.0}
+                _curve(ax, style, "|".join((agent, engine, name)), *found.to_numpy().T)
+        ax.axvline(0.0, color=INK, lw=0.9, zorder=1.5)
+        ax.set_xlabel("control steps since the intervention")
+        ax.set_ylabel("reward of a control step")
+        ax.set_title(f"{name} {chart.words[name]}", loc="left", weight="bold")
+    return figure
+
+
+FIGURES: Mapping[str, Callable[[Evaluation, str | None], Figure]] = {
+    "bars": bars_figure,
+    "radar": radar_figure,
+    "profile": profile_figure,
+    "strength": strength_figure,
+    "recovery": recovery_figure,
+}
 
 
 def write_figures(
-    evaluation: Evaluation, folder: Location | str, metric: str | None = None
+    evaluation: Evaluation,
+    folder: Location | str,
+    metric: str | None = None,
+    *,
+    reference: str | None = None,
 ) -> tuple[Location, ...]:
     """Draw every figure that an evaluation has numbers for.
 
@@ -315,26 +491,33 @@ def write_figures(
         evaluation: The evaluation.
         folder: Where to; it is there. It may be a URL. Figures of an earlier evaluation go.
         metric: One of ``METRICS``; the first that the evaluation has if None.
+        reference: The agent with which ``regret.png`` compares the others; no such figure if None.
 
     Returns:
-        The files: ``bars.png``, ``radar.png`` of three protocols or more, and ``profile.png``
-        where all agents have played the same protocols.
+        The files: ``bars.png``; ``radar.png`` of three protocols or more; ``profile.png`` where all
+        agents have played the same protocols; ``strength.png`` where variables are drawn;
+        ``regret.png`` of protocols that vary one variable; and ``recovery.png`` of rewards by step.
 
     Raises:
-        UnknownOption: The metric is unknown, or episodes are missing.
+        UnknownOption: The metric or the reference is unknown, or episodes are missing.
         UnwritableFolder: The disk is full, or permission is missing.
     """
     metric, place = evaluation.metric(metric), located(folder)
     if not len(evaluation):
         raise UnknownOption("evaluation", "without episodes", ("one with an episode or more",))
-    files = []
-    for name, draw in FIGURES.items():
+    one_of("reference", reference, (None, *evaluation.agents))
+    files, drawn = list[Location](), dict(FIGURES)
+    if reference is not None:
+        drawn["regret"] = partial(regret_figure, reference=reference)
+    for name in (*FIGURES, "regret"):
         path = place / f"{name}.png"
         remove(path)
+        if name not in drawn:
+            continue
         try:
-            figure = draw(evaluation, metric)
+            figure = drawn[name](evaluation, metric)
         except UnknownOption:
-            if draw is bars_figure:
+            if name == "bars":
                 raise
             continue
         save(figure, path)

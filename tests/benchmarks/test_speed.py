@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT))  # the scripts are no part of the package
 
 from benchmarks.speed import __main__ as command  # noqa: E402 # from there
-from benchmarks.speed import goals, tables  # noqa: E402
+from benchmarks.speed import goals, history, tables  # noqa: E402
 from benchmarks.speed.batches import beside_the_engine, living, over_worlds  # noqa: E402
 from benchmarks.speed.growth import line  # noqa: E402
 from benchmarks.speed.memory import resets, resident  # noqa: E402
@@ -241,3 +241,58 @@ def test_a_broken_section_does_not_take_the_others(
     document = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))
     assert document["results"] == {"import": {"scm_world [s]": 0.1}}
     assert "no room" in capsys.readouterr().err
+
+
+ABOUT = {
+    "processor": "Some processor",
+    "cores": 2,
+    "system": "Linux x86_64",
+    "versions": {"scm-world": "0.3.0"},
+}
+
+
+def test_history_has_a_line_for_each_release_and_machine(tmp_path: Path) -> None:
+    """A second run of a release replaces the first; other releases and machines stay."""
+    path, title = (
+        tmp_path / "history.jsonl",
+        "64 pushing worlds on two threads: times as fast as on one, wall",
+    )
+    measured = {"batch": {"mujoco": {"pushing": {"2 threads to 1: ratio": 1.5}}}}
+    newer = {**ABOUT, "versions": {"scm-world": "0.4.0"}}
+    for about in (ABOUT, newer, {**newer, "cores": 8}):
+        history.record(about, measured, quick=True, path=path)
+    measured["batch"]["mujoco"]["pushing"]["2 threads to 1: ratio"] = 1.75
+    history.record(newer, measured, quick=False, path=path)
+
+    rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    assert rows == history.read(path)
+    found = [(row["version"], row["machine"], row["quick"], row["figures"]) for row in rows]
+    assert found == [
+        ("0.3.0", "Some processor, 2 cores, Linux x86_64", True, {title: 1.5}),
+        ("0.4.0", "Some processor, 8 cores, Linux x86_64", True, {title: 1.5}),
+        ("0.4.0", "Some processor, 2 cores, Linux x86_64", False, {title: 1.75}),
+    ]
+    assert rows[0]["commit"]
+
+    page, picture = tmp_path / "speed.md", tmp_path / "history.png"
+    page.write_text("a\n<!-- history: begin -->\nold\n<!-- history: end -->\nb\n", encoding="utf-8")
+    history.publish(rows, page, picture)
+    assert "(../images/history.png)" in page.read_text(encoding="utf-8")
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_busy_machine_is_not_recorded(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It is refused before anything is measured; rough figures never replace the others."""
+    monkeypatch.setattr(command.os, "getloadavg", lambda: (8.0, 8.0, 8.0))
+    monkeypatch.setattr(command.os, "cpu_count", lambda: 4)
+    with pytest.raises(SystemExit):
+        command.arguments(["--quick", "--record"])
+    assert "the load is 2.00 a core" in capsys.readouterr().err
+    quick = command.arguments(["--quick"])
+    quick.out.rmdir()
+    assert (quick.out == command.HERE, quick.page) == (False, None)
+    assert command.arguments([]).out == command.HERE
+    monkeypatch.setattr(command.os, "getloadavg", lambda: (0.9, 8.0, 8.0))
+    assert command.arguments(["--record"]).record

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -22,11 +23,15 @@ from scm_world.evaluation.figures import (
     bars_figure,
     profile_figure,
     radar_figure,
+    recovery_figure,
+    regret_figure,
     save,
+    strength_figure,
     write_figures,
 )
 from scm_world.evaluation.protocols import protocols_of
 from scm_world.evaluation.results import Evaluation
+from scm_world.evaluation.statistics import mean_interval
 
 DOCS = {protocol.name: protocol.doc for protocol in protocols_of("pushing")}
 BOTH = ("mujoco", "bullet")
@@ -279,13 +284,73 @@ def test_agents_with_equal_scores_are_all_seen() -> None:
         assert len(places) == 3
 
 
+# --- adaptation ---------------------------------------------------------------------------------
+
+
+def test_strength_has_the_mean_score_of_each_bin() -> None:
+    """P1 and P2 draw the mass alone: 80 draws are eight bins of ten, in the order of the mass."""
+    evaluation = made(2, 3, n=40, runs=2)
+    figure = strength_figure(evaluation)
+    assert len(figure.axes) == 1  # the friction, which no protocol names, has no panel
+    frame, column = evaluation.frame, "drawn tool_block.mass"
+    for agent in evaluation.agents:
+        mine = frame[(frame["agent"] == agent) & frame[column].notna()]
+        draws = [(one[column].iloc[0], one["last_fractional_success"].mean())
+                 for _, one in mine.groupby(["protocol", "episode"])]  # fmt: skip
+        bins = np.array(sorted(draws)).reshape(8, 10, 2)
+        (line,) = named(figure, rf"{agent}\|mujoco\|{column}\|0")
+        np.testing.assert_allclose(line.get_xydata(), bins.mean(axis=1))
+        (band,) = named(figure, rf"band {agent}\|.*")
+        ends = [mean_interval(one) for one in bins[:, :, 1]]
+        low, high = band.get_paths()[0].vertices[:, 1].min(), max(one.high for one in ends)
+        np.testing.assert_allclose(low, min(one.low for one in ends))
+        np.testing.assert_allclose(band.get_paths()[0].vertices[:, 1].max(), high)
+    (shade,) = named(figure, "A")
+    values = frame[frame["protocol"] == "P1"][column]
+    assert shade.get_x() == values.min()
+    assert shade.get_x() + shade.get_width() == pytest.approx(values.max())
+    assert_readable(figure)
+
+
+def test_regret_has_the_difference_of_the_means() -> None:
+    """Rows are the protocols that vary one variable, columns all agents but the reference."""
+    evaluation = made(3, 9)
+    figure = regret_figure(evaluation, reference="sac")
+    (ax,) = figure.axes
+    mean = evaluation.frame.groupby(["protocol", "agent"])["last_fractional_success"].mean()
+    rows = ["P1", "P2", "P3", "P4", "P5"]
+    wanted = [[mean[row, "sac"] - mean[row, agent] for agent in ("ppo", "td3")] for row in rows]
+    np.testing.assert_allclose(np.array(ax.images[0].get_array()), wanted)
+    cell = evaluation.regret("td3", "sac", "P5")
+    assert ax.texts[-1].get_text().split("\n")[0] == f"{cell.value:.2f}"
+    assert_readable(figure)
+    with pytest.raises(UnknownOption, match="varies one variable"):
+        regret_figure(made(2, 1), reference="sac")
+
+
+def test_recovery_has_the_mean_reward_by_step() -> None:
+    """Of 120 steps, three make a point, and they are counted from the intervention at 100."""
+    evaluation = made(2, 13, n=4, kept=lambda row: row["protocol"] == "P0@100")
+    rewards = np.random.default_rng(0).random((8, 120))
+    figure = recovery_figure(replace(evaluation, rewards=rewards))
+    for agent in evaluation.agents:
+        mine = rewards[(evaluation.frame["agent"] == agent).to_numpy()]
+        (line,) = named(figure, rf"{agent}\|mujoco\|P0@100")
+        points = [(at - 100, mine[:, at : at + 3].mean()) for at in range(1, 120, 3)]
+        np.testing.assert_allclose(line.get_xydata(), points)
+        assert len(named(figure, rf"band {agent}\|.*")) == 1
+    assert_readable(figure)
+    with pytest.raises(UnknownOption, match="steps=True"):
+        recovery_figure(evaluation)
+
+
 # --- files ------------------------------------------------------------------------------------
 
 
 def test_every_figure_that_has_numbers_is_written(tmp_path: Path) -> None:
     """One episode in two protocols has bars only; nothing of an earlier evaluation stays."""
-    many = write_figures(made(2, 4, runs=2), tmp_path)
-    assert [path.name for path in many] == ["bars.png", "radar.png", "profile.png"]
+    many = write_figures(made(2, 4, runs=2), tmp_path, reference="sac")
+    assert [path.stem for path in many] == ["bars", "radar", "profile", "strength", "regret"]
     few = write_figures(made(1, 2, n=1), tmp_path)
     assert [path.name for path in few] == ["bars.png"]
     assert [path.name for path in tmp_path.iterdir()] == ["bars.png"]
