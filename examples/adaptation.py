@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +20,8 @@ import pandas
 from numba import njit
 
 from scm_world import Box, ModelTask
-from scm_world.evaluation import Adaptive, Protocol, evaluate, inferred
+from scm_world.evaluation import Adaptive, Inferred, Protocol, evaluate, inferred
+from scm_world.evaluation.figures import write_figures
 from scm_world.evaluation.results import Evaluation
 
 HERE = Path(__file__).resolve()
@@ -174,6 +177,7 @@ def study(task: str, seeds: int, steps: int, episodes: int, folder: Path) -> Eva
     source = f"{HERE}:{TASKS[task].__name__}"
     found = evaluate(agents, protocols(task), task=source, n=episodes, out=folder / task / "tests")
     found.save(folder / task)
+    write_figures(found, folder / task, reference="privileged")
     for agent, seed in itertools.product(("history", "recurrent", "student"), range(seeds)):
         path = folder / task / f"inferred-{agent}-{seed}.json"
         if not path.exists():
@@ -183,36 +187,45 @@ def study(task: str, seeds: int, steps: int, episodes: int, folder: Path) -> Eva
                 [*CAUSES[task].values()],
                 task=source,
                 privileged=judge,
-                n=2 * episodes,
+                n=max(2 * episodes, 12),
                 seed=seed,
             )
             probed.save(path)
     return found
 
 
-def table(found: Evaluation) -> pandas.DataFrame:
-    """Return the gain of each agent over the randomised one in each protocol, with intervals."""
+def tables(found: Evaluation, folder: Path) -> Iterator[tuple[str, pandas.DataFrame]]:
+    """Return what came out: scores, gains over the randomised agent, regrets, inferred causes."""
     others = [agent for agent in found.agents if agent != "randomised"]
-    rows = [
-        {"protocol": name, "randomised": str(found.score(name, agent="randomised"))}
-        | {agent: str(found.difference(agent, "randomised", name)) for agent in others}
-        for name in found.protocols
-    ]
-    return pandas.DataFrame(rows)
+    scores, gains, regrets = [], [], []
+    for name in found.protocols:
+        scores.append({a: str(found.score(name, agent=a)) for a in found.agents})
+        gains.append({a: str(found.regret("randomised", a, name)) for a in others})
+        left = [agent for agent in others if agent != "privileged"]
+        regrets.append({a: str(found.regret(a, "privileged", name)) for a in left})
+    yield "return", pandas.DataFrame(scores, index=found.protocols)
+    yield "gain over the randomised agent", pandas.DataFrame(gains, index=found.protocols)
+    yield "regret to the privileged agent", pandas.DataFrame(regrets, index=found.protocols)
+    files = sorted(folder.glob("inferred-*.json"))
+    probes = {path.stem.removeprefix("inferred-"): Inferred.load(path).verdicts() for path in files}
+    yield "inferred", pandas.DataFrame(probes).T
 
 
-def main(arguments: list[str] | None = None) -> None:
+def main(*arguments: str) -> None:
     """Run the study of some tasks."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("tasks", nargs="*", choices=[*TASKS, []], default=["cart"])
+    parser.add_argument("tasks", nargs="*", default=["cart"], help=", ".join(TASKS))
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--steps", type=int, default=150_000, help="of each training")
-    parser.add_argument("--episodes", type=int, default=50, help="of each protocol")
-    parser.add_argument("--out", type=Path, default=Path("adaptation"))
-    given = parser.parse_args(arguments)
+    parser.add_argument("--episodes", type=int, default=20, help="of each protocol and seed")
+    parser.add_argument("--out", default="adaptation")
+    given = parser.parse_args(arguments or None)
+    folder = Path(given.out or tempfile.mkdtemp())
     for task in given.tasks:
-        found = study(task, given.seeds, given.steps, given.episodes, given.out)
-        print(f"{task}: return of the randomised agent, and what the others gain", table(found))
+        found = study(task, given.seeds, given.steps, given.episodes, folder)
+        for title, table in tables(found, folder / task):
+            table.to_csv(folder / task / f"{title.replace(' ', '_')}.csv")
+            print(f"\n{task}: {title}", table.to_string(), sep="\n")
 
 
 if __name__ == "__main__":

@@ -240,10 +240,11 @@ class Adaptive:
             for _, own in blocks_of(targets):
                 known[own] = known[own].all()
             new, spread, center = fit.scaled.copy(), fit.spread.copy(), self._moments[0]
-            own = np.flatnonzero(~np.isnan(center))
-            if len(own) and (fit.explains or not fit.ended):
-                mean, left = posterior(*self._moments, new[own], spread[np.ix_(own, own)])
-                new[own], spread[np.ix_(own, own)], known[own] = mean, left, True
+            with_prior = np.flatnonzero(~np.isnan(center))
+            if len(with_prior) and (fit.explains or not fit.ended):
+                square = np.ix_(with_prior, with_prior)
+                mean, rest = posterior(*self._moments, new[with_prior], spread[square])
+                new[with_prior], spread[square], known[with_prior] = mean, rest, True
             which = np.flatnonzero(known)
             if self.use == "draw" and known.any():
                 root = root_of(spread[np.ix_(which, which)])
