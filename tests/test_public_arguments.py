@@ -302,6 +302,7 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
     }  # fmt: skip
     # Curricula.
     yield curricula.CurriculumEnv, {"env": env, "curriculum": part}
+    yield curricula.LevelsEnv, {"env": env, "levels": 2, "level_seed": 0}
     yield curricula.CurriculumState, {"episode": 0, "stages": {}, "noise": (0, 0), "every": 1}
     yield curricula.Progress, {"level": 0, "recent": (True,)}
     yield curricula.at_step, {"step": 3, "part": part}
@@ -319,6 +320,7 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
     yield curricula.make_vec, {
         "env_id": "scm_world/Pushing-v0", "num_envs": 1, "curriculum": part,
         "autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP, "backend": "fake",
+        "levels": None, "level_seed": 0,
     }  # fmt: skip
     # Discovery and data.
     store = {"out": None, "shard": None, "progress": None, "workers": 1, "engine": None}
