@@ -188,6 +188,7 @@ def test_the_tables_of_variables_are_up_to_date() -> None:
 
 
 EXAMPLES: dict[str, tuple[str, ...]] = {  # each with arguments that make it short
+    "adaptation": ("cart", "--steps", "1600", "--episodes", "2", "--out", ""),
     "augmentation": ("24", "60"),
     "cartpole": (),
     "cartpole_swing_up": (),
@@ -222,6 +223,7 @@ SHORT = (
     *("sim_to_sim", "train_and_evaluate", "transfer_a_to_b"),
 )
 LEARNING = {  # they need the extra "train", which few machines have
+    "adaptation": ("sb3_contrib",),
     "train_and_evaluate": ("stable_baselines3",),
     "representations": ("torch", "sklearn", "pyarrow", "PIL"),
     "demonstrations": ("torch",),

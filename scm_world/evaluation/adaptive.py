@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, final
 
 import numpy as np
@@ -15,11 +15,13 @@ from scm_world.env import ScmWorldEnv
 from scm_world.errors import ScmWorldError, UnknownOption, UnknownVariable, in_one_line
 from scm_world.evaluation.recording import UNUSED, parts, whole
 from scm_world.fit.online import OnlineFit
-from scm_world.fit.targets import blocks_of, ranges_of, values_of
+from scm_world.fit.targets import Target, blocks_of, ranges_of, values_of
+from scm_world.graph import SCM
 from scm_world.policies.agents import Actions, WorldPolicy, as_agent
 from scm_world.policies.cards import HISTORY, PolicyAbout
 from scm_world.policies.planning import CrossEntropy
 from scm_world.variables import Normal
+from scm_world.variables.kinds import SPACES, SpaceName
 
 STREAM = "what an adaptive agent believes"
 USES = ("mean", "draw")
@@ -31,7 +33,8 @@ class Adaptive:
 
     It records what it observes and does. After some control steps it fits the parameters to that,
     from the beginning of its episode on. Until then it believes the defaults that the world
-    declares, and what a fit does not determine stays as it was believed. The true values of the
+    declares, and what a fit does not determine stays as it was believed; with ``prior="A"`` it
+    believes the mean of the posterior instead, however little was seen. The true values of the
     parameters, and of all parameters that follow from them, never reach the policy: in the
     observation the believed ones are in their place. Give all that it should not be told as
     ``parameters``; other variables are shown to it as they are.
@@ -52,6 +55,8 @@ class Adaptive:
             an episode; all if None.
         use: ``"mean"``: it acts by the fitted values; ``"draw"``: by a draw from what the fit
             leaves open, anew after each fit, from the noise of the episode.
+        prior: ``"A"``, ``"B"`` or ``"A|B"``: parameters that have this space begin with its mean
+            and covariance, of which a fit makes those of a normal posterior; see ``posterior``.
         keeps: Whether what it believes holds in the next episode, too, until ``forget`` is called:
             for draws of protocols that are repeated. Each fit is of one episode.
 
@@ -89,6 +94,7 @@ class Adaptive:
         iterations: int = 8,
         last: int | None = None,
         use: str = "mean",
+        prior: SpaceName | None = None,
         keeps: bool = False,
     ) -> None:
         inside = policy.policy if isinstance(policy, WorldPolicy) else policy
@@ -104,6 +110,8 @@ class Adaptive:
         self.iterations = whole_number("iterations", iterations, least=1)
         self.last = None if last is None else whole_number("last", last, least=2)
         one_of("use", use, USES)
+        one_of("prior", prior, (None, *SPACES))
+        self.prior = prior
         self.use, self.keeps = use, true_or_false("keeps", keeps)
         self.history: list[dict[str, Any]] = []
         self._env: ScmWorldEnv | None = None
@@ -115,7 +123,7 @@ class Adaptive:
 
     def __fingerprint__(self) -> dict[str, Any]:
         """Return all that decides what it does."""
-        how = (self.after, self.every, self.iterations, self.last, self.use, self.keeps)
+        how = (self.after, self.every, self.iterations, self.last, self.use, self.keeps, self.prior)
         about = {n: v for n, v in self._agent.about.items() if n not in ("path", "fingerprint")}
         policy: Any = None if "sha256" in about else self._agent.policy
         if self._planner is not None:
@@ -126,7 +134,7 @@ class Adaptive:
 
     def __getstate__(self) -> dict[str, Any]:
         """Copy and pickle without the episode."""
-        private = ("_shadow", "_fit", "_seen", "_scaled")
+        private = ("_shadow", "_fit", "_seen", "_scaled", "_moments")
         state = {name: value for name, value in vars(self).items() if name not in private}
         return {**state, "_env": None, "history": []}
 
@@ -144,7 +152,8 @@ class Adaptive:
         """Believe the declared values of the parameters again."""
         if self._env is not None:
             self._fit.begin()
-            self._scaled = self._fit.scaled
+            center = self._moments[0]
+            self._scaled = np.where(np.isnan(center), self._fit.scaled, center)
 
     def act(self, observation: Observation) -> Actions:
         """Fit, if it is time, and choose an action."""
@@ -193,7 +202,11 @@ class Adaptive:
             missing = sorted(written - shown)[0]
             allowed = ("one that observes it: as_agent(policy, env={'context': 'observation'})",)
             raise UnknownOption(f"policy that does not observe {missing!r}", "this one", allowed)
-        self._env = env
+        center, prior = moments(self._fit.targets, model, self.prior)
+        own, sizes = ~np.isnan(center), np.ones(len(center))
+        sizes[own] = np.sqrt(np.diag(prior))
+        self._fit.rescale(sizes)
+        self._env, self._moments = env, moments(self._fit.targets, model, self.prior)
         self.forget()
 
     def _believe(self, scaled: Floats) -> None:
@@ -226,12 +239,18 @@ class Adaptive:
         targets, reason = self._fit.targets, ""
         try:
             fit = self._fit.update(np.array(self._commands), np.array(self._values))
-            known = fit.table["determined"].to_numpy(bool)
+            known = fit.table["determined"].to_numpy(bool, copy=True)
             for _, own in blocks_of(targets):
                 known[own] = known[own].all()
-            new, which = fit.scaled.copy(), np.flatnonzero(known)
+            new, spread, center = fit.scaled.copy(), fit.spread.copy(), self._moments[0]
+            with_prior = np.flatnonzero(~np.isnan(center))
+            if len(with_prior) and (fit.explains or not fit.ended):
+                square = np.ix_(with_prior, with_prior)
+                mean, rest = posterior(*self._moments, new[with_prior], spread[square])
+                new[with_prior], spread[square], known[with_prior] = mean, rest, True
+            which = np.flatnonzero(known)
             if self.use == "draw" and known.any():
-                root = np.linalg.cholesky(fit.spread[np.ix_(which, which)])
+                root = root_of(spread[np.ix_(which, which)])
                 place = {"episode": env.world.episode, "step": steps}
                 noise = env.world.noise.draw(Normal(), STREAM, (len(new),), {}, **place)[0]
                 new[which] = new[which] + root @ noise[which]
@@ -244,3 +263,53 @@ class Adaptive:
             reason = in_one_line(error)
         values = {name: np.array(v) for name, v in values_of(targets, self._scaled).items()}
         self.history.append({"step": steps, "values": values, "reason": reason})
+
+
+def moments(
+    targets: Sequence[Target], model: SCM, prior: SpaceName | None
+) -> tuple[Floats, Floats]:
+    """Return the mean of each target in a space, NaN without one, and the covariance of the others.
+
+    They are those of 1,000 draws, scaled, shape (p,) and (m, m).
+    """
+    random, count, columns = np.random.default_rng(0), 1000, list[Floats]()
+    center, drawn = np.full(len(targets), np.nan), dict[str, Floats]()
+    for i, target in enumerate(targets):
+        variable = model.declared(target.variable) if target.values is not None else None
+        space = variable.space(prior) if variable is not None and prior is not None else None
+        if variable is None or space is None or target.block is not None or space.parents():
+            continue
+        if target.variable not in drawn:
+            uniforms = random.random((count, space.n_uniforms(variable.shape)))
+            draws = space.transform(uniforms, variable.shape, {})
+            drawn[target.variable] = np.asarray(draws, float).reshape(count, -1)
+        columns.append(target.scaled(drawn[target.variable][:, target.component]))
+        center[i] = columns[-1].mean()
+    shape = len(columns), len(columns)
+    return center, np.cov(columns).reshape(shape) if columns else np.empty(shape)
+
+
+def posterior(
+    center: Floats, prior: Floats, found: Floats, spread: Floats
+) -> tuple[Floats, Floats]:
+    """Return mean and covariance of a normal posterior.
+
+    Args:
+        center: Mean of the prior, shape (p,); NaN of what has none.
+        prior: Its covariance, shape (m, m), of the others.
+        found: What a fit without a prior found of these, shape (m,).
+        spread: The covariance of its errors, shape (m, m); it may be as good as infinite.
+
+    Source:
+        Särkkä, *Bayesian Filtering and Smoothing*, 2013, equation 4.20 (the Kalman update).
+    """
+    mean = center[~np.isnan(center)]
+    gain = np.linalg.solve(prior + spread, prior).T
+    return mean + gain @ (found - mean), prior - gain @ prior
+
+
+def root_of(spread: Floats) -> Floats:
+    """Return a matrix whose product with its transpose is a covariance, which may be singular."""
+    sizes, axes = np.linalg.eigh((spread + spread.T) / 2.0)
+    found: Floats = axes * np.sqrt(np.maximum(sizes, 0.0))
+    return found

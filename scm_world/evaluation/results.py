@@ -196,7 +196,7 @@ class Evaluation:
         frame = self.frame.assign(episode=self.frame["episode"] // each)
         groups = frame.groupby([*KEYS], sort=False, as_index=False)
         for label in (one for columns in drawn_columns(frame).values() for one in columns):
-            how[label] = "mean" if (groups[label].nunique()[label] > 1).any() else "first"
+            how[label] = "mean" if groups[label].nunique()[label].max() > 1 else "first"
         frame = groups.agg(how)
         return replace(self, about={**self.about, "protocols": [*about.values()]}, frame=frame,
                        rewards=None)  # fmt: skip

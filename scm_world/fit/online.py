@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import Any, final
 
 import numpy as np
@@ -72,6 +73,18 @@ class OnlineFit:
         self.columns, self._noise = tuple(found), np.array([*found.values()])
         self._shooting: Shooting | None = None
         self.begin()
+
+    def rescale(self, sizes: Floats) -> None:
+        """Take steps of these sizes, scaled, shape (p,), of parameters that can be zero.
+
+        They are asked for before the first fit. A size of 0 changes nothing.
+        """
+        self.targets = tuple(
+            replace(t, low=t.low / size, high=t.high / size, scale=t.scale * size)
+            if not t.log and size > 0.0
+            else t
+            for t, size in zip(self.targets, sizes, strict=True)
+        )
 
     def begin(self) -> None:
         """Begin another run, from the parameters of the world."""

@@ -25,6 +25,7 @@ from scm_world.fit.recordings import (
 from scm_world.fit.targets import (
     Target,
     begin,
+    channels_of,
     delays_of,
     free_states,
     remembered,
@@ -147,20 +148,23 @@ class Shooting(Simulator):
         world = self._begin(0)
         where, default = world.compiled.slices, world.vector.copy()
         known, moving = [], []  # measured numbers, and velocities of measured positions
+        sensed = {one.name("reading"): one.of.name for one in channels_of(world) if not one.acts}
+        measured = {sensed.get(name, name) for name in self._names}
         begun = [(self._places[i], i) for i in self._begins]
-        for i, (_, name, component, _) in enumerate(self.columns[: self._begins.start]):
+        for i, (_, column, component, _) in enumerate(self.columns[: self._begins.start]):
+            name = sensed.get(column, column)
             if name in where:
                 known.append((where[name].start + component, i))
                 stem, _, quantity = name.rpartition(".")
                 speed = f"{stem}.{SPEEDS.get(quantity)}"
-                if quantity not in TURNS and speed in where and speed not in self._names:
+                if quantity not in TURNS and speed in where and speed not in measured:
                     moving.append((where[speed].start + component, i))
         turning, states = [], world.composition.system.states  # angular velocities
         frames = {row.name: getattr(row, "frame", "body") for row in states}
         for places in self.rotations:
             name = self.columns[places[0]].variable
             speed = f"{name.removesuffix('orientation')}angular_velocity"
-            if name in where and speed in where and speed not in self._names:
+            if name in where and speed in where and speed not in measured:
                 turning.append((where[speed], places, frames.get(speed, "body")))
         starts = np.repeat(default[None], len(windows), axis=0)
         kept = np.zeros(starts.shape, dtype=np.bool_)

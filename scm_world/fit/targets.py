@@ -30,6 +30,7 @@ from scm_world.fit.inertia import (
 from scm_world.fit.recordings import MeasuredNumber, labels, settable_of
 from scm_world.queries.twins import twins_of
 from scm_world.queries.world import World
+from scm_world.tasks.channels import Channel
 from scm_world.variables import Box, Variable
 from scm_world.variables.distributions import Normal
 from scm_world.variables.interventions import Mechanism
@@ -213,8 +214,20 @@ def posterior_of(targets: Sequence[Target], scaled: Floats, spread: Floats) -> d
 
 
 def begin(twin: Simulation, world: World) -> None:
-    """Begin an episode of a twin with the values that the world is given."""
+    """Begin an episode of a twin with the values that the world is given.
+
+    Sensors and actuators have no noise there: a model predicts what is measured without its error.
+    """
     twin.reset(seed=0, do=world.plan.at_start())
+    noisy = [one.name("noise") for one in channels_of(twin) if one.noise is not None]
+    if noisy:
+        twin.do(dict.fromkeys(noisy, 0.0))
+
+
+def channels_of(world: Simulation) -> Sequence[Channel]:
+    """Return the sensors and actuators that have noise or a delay."""
+    found: Sequence[Channel] = getattr(world.task, "channels", ())
+    return found
 
 
 @contextmanager

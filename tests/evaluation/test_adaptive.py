@@ -13,6 +13,7 @@ from adaptation_samples import FORM, MASS, MEASURES, TOLD, Cart, Shaking, adapti
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import NotIntervenable, UnknownOption, UnknownVariable
 from scm_world.evaluation import Adaptive, evaluate, inferred, play
+from scm_world.evaluation.adaptive import posterior
 from scm_world.policies import as_agent
 from scm_world.policies.planning import CrossEntropy
 
@@ -208,7 +209,14 @@ def test_what_cannot_be_fitted_or_shown_is_refused() -> None:
     ):
         with pytest.raises(error):
             as_agent(Adaptive(TOLD, parameters, measures=measures)).start(shown)
-    for wrong in ({"after": 0}, {"every": 0}, {"iterations": 0}, {"last": 1}, {"use": "mode"}):
+    for wrong in (
+        {"after": 0},
+        {"every": 0},
+        {"iterations": 0},
+        {"last": 1},
+        {"use": "mode"},
+        {"prior": "C"},
+    ):
         with pytest.raises(UnknownOption):
             Adaptive(TOLD, MASS, measures=MEASURES, **wrong)
 
@@ -221,3 +229,36 @@ def test_what_it_believes_is_its_hidden_state() -> None:
     assert first.verdict == "no"
     assert first.scores["observation"]["linear"].value < 0.5
     assert end.scores["hidden"]["linear"].low > 0.9
+
+
+def test_a_prior_is_that_of_bayes() -> None:
+    """Of a normal prior and errors, by precisions; what has no prior is left out."""
+    random = np.random.default_rng(0)
+    roots = random.normal(size=(2, 3, 3))
+    prior, spread = roots @ roots.transpose(0, 2, 1) + 0.1 * np.eye(3)
+    center, found = random.normal(size=3), random.normal(size=3)
+    precision = np.linalg.inv(prior) + np.linalg.inv(spread)
+    direct = np.linalg.solve(
+        precision, np.linalg.solve(prior, center) + np.linalg.solve(spread, found)
+    )
+    mean, left = posterior(np.insert(center, 1, np.nan), prior, found, spread)
+    np.testing.assert_allclose(mean, direct)
+    np.testing.assert_allclose(left, np.linalg.inv(precision), atol=1e-12)
+    blind = posterior(center, prior, found, 1e20 * np.eye(3))[0]
+    np.testing.assert_allclose(blind, center, atol=1e-6)
+
+
+def test_with_a_prior_it_believes_the_mean_of_the_space_until_it_sees_more() -> None:
+    """At rest nothing shows the mass; a swing does, also of a mass outside of the space."""
+    still = as_agent(lambda seen: 0.0 * seen[4:], env={**FORM, "include": [MASS]})
+    agent = Adaptive(still, MASS, after=15, measures=MEASURES, prior="A")
+    env = cart()
+    space = env.world.model[MASS].a
+    low, high = np.ravel(space.low)[0], np.ravel(space.high)[0]
+    middle = np.exp(np.log(np.linspace(low, high, 100_001)).mean())
+    play(env, as_agent(agent), {"hinge.position": 0.0, MASS: 0.3}, seed=0)
+    assert agent.history[0]["values"][MASS] == pytest.approx(middle, rel=0.05)
+    seeing = Adaptive(TOLD, MASS, after=15, measures=MEASURES, prior="A")
+    for mass, near in ((0.3, 0.02), (1.5 * high, 0.1)):  # the prior draws the second one to itself
+        play(env, as_agent(seeing), {**STEADY, MASS: mass}, seed=0)
+        assert seeing.history[0]["values"][MASS] == pytest.approx(mass, rel=near)

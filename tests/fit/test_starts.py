@@ -224,3 +224,42 @@ def test_what_was_held_out_is_predicted() -> None:
             world.fit(recording, NAMES, held_out=wrong)
     with pytest.raises(UnknownOption, match="more than 10 rows"):
         fit.predict({name: values[:10] for name, values in recording.items()})
+
+
+PUSHED = """
+<mujoco model="cart"><option timestep="0.01"/><worldbody><body name="cart">
+  <joint name="slider" type="slide" axis="1 0 0" damping="1"/>
+  <geom type="box" size=".1 .1 .1" mass="1"/></body></worldbody>
+  <actuator><motor name="motor" joint="slider" gear="10" ctrlrange="-1 1"/></actuator></mujoco>
+"""
+
+
+def pushed(commands: Floats, force: float, place: float, speed: float) -> Floats:
+    """Return the positions of a plain simulation."""
+    model = mujoco.MjModel.from_xml_string(PUSHED)
+    data = mujoco.MjData(model)
+    data.qpos[0], data.qvel[0], data.xfrc_applied[1, 0] = place, speed, force
+    found = [place]
+    for command in commands:
+        data.ctrl[0] = command
+        mujoco.mj_step(model, data, nstep=5)
+        found.append(float(data.qpos[0]))
+    return np.array(found)
+
+
+@pytest.mark.parametrize("column", ["slider.position_reading", "slider.position"])
+def test_readings_of_noisy_sensors_are_fitted(column: str) -> None:
+    """As what they measure: the world that has noise predicts without it. It is a linear model."""
+    noise, names = {"slider.position": 0.02, "motor.control": 0.02}, ["cart.external_force"]
+    world = sw.World(PUSHED, control_dt=0.05, noise=noise, expose=["*", "*.external_force"])
+    run = world.rollout("random", seed=1, steps=40, do={names[0]: [3.0, 0.0, 0.0]})
+    commands, seen = run.actions[:, 0], run["slider.position_reading"]
+    table = {"time": 0.05 * np.arange(41), "motor.control": np.append(commands, np.nan)}
+    found = world.fit({**table, column: seen}, names, noise={column: 0.02})
+    base = pushed(commands, 0.0, 0.0, 0.0)
+    basis = [pushed(commands, *unit) - base for unit in np.eye(3)]
+    best, *_ = np.linalg.lstsq(np.stack(basis, axis=1), seen - base, rcond=None)
+    first = found.table.iloc[0]
+    assert first["value"] == pytest.approx(best[0], abs=1e-3)
+    assert first["low"] < best[0] < first["high"]
+    assert best[0] == pytest.approx(3.0, abs=0.2)
