@@ -372,7 +372,7 @@ def inferred(
             whole_number("steps", step, least=0, most=length - 1)
         probed = (*dict.fromkeys(wanted), END)
         usual = min(25, length // 4)
-        start = whole_number("at", max(usual, 1) if at is None else at, least=0)
+        start = whole_number("at", min(max(usual, 1), length - 1) if at is None else at, least=0)
         later = whole_number("after", usual if after is None else after, least=0)
         pair = start, start + later
         if start:

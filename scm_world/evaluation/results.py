@@ -196,7 +196,7 @@ class Evaluation:
         frame = self.frame.assign(episode=self.frame["episode"] // each)
         groups = frame.groupby([*KEYS], sort=False, as_index=False)
         for label in (one for columns in drawn_columns(frame).values() for one in columns):
-            how[label] = "mean" if groups[label].nunique()[label].max() > 1 else "first"
+            how[label] = "mean" if np.max(groups[label].nunique()[label]) > 1 else "first"
         frame = groups.agg(how)
         return replace(self, about={**self.about, "protocols": [*about.values()]}, frame=frame,
                        rewards=None)  # fmt: skip
@@ -333,7 +333,8 @@ class Evaluation:
         if any(
             one.isna().any(axis=None) or not one.index.equals(tables[0].index) for one in tables
         ):
-            raise UnknownOption("draws", "others", ("those that every run of both has played",))
+            allowed = ("one whose draws every run of both agents has played",)
+            raise UnknownOption("protocol", protocol, allowed)
         return tables, rows
 
     @typed

@@ -150,6 +150,9 @@ def test_regret_counts_training_runs_and_draws() -> None:
     assert found.probability_of_improvement("a", "b", "A").value == pytest.approx(np.mean(wins))
     regret = found.regret("a", "b", "A")
     assert regret.value == pytest.approx(b.mean() - a.mean())
+    unpaired = Evaluation(found.about, found.frame.drop(index=3))
+    with pytest.raises(UnknownOption, match="every run of both"):
+        unpaired.regret("a", "b", "A")
     parts = [a.mean(1), b.mean(1), b.mean(0) - a.mean(0)]
     shares = np.array([part.var(ddof=1) / len(part) for part in parts])
     free = shares.sum() ** 2 / sum(s**2 / (len(p) - 1) for s, p in zip(shares, parts, strict=True))
