@@ -171,6 +171,9 @@ class Lesson(Frozen):
     def _remembers(self) -> Self:
         if self.memory and self.symmetric:
             raise UnknownOption("symmetric", True, ("False", "True with memory=False"))
+        if self.symmetric and self.env.get("history"):
+            known = ("0", "a number with symmetric=False")
+            raise UnknownOption("env.history of a lesson", self.env["history"], known)
         if self.network.recurrent is not None and (self.memory or self.symmetric):
             known = ("None", "a width with memory=False and symmetric=False")
             raise UnknownOption("network.recurrent", self.network.recurrent, known)

@@ -314,6 +314,8 @@ def test_a_network_learns_to_remember() -> None:
 
 def test_only_a_teacher_that_says_what_it_remembers_teaches_it() -> None:
     """Nor are scenes turned then."""
+    with pytest.raises(UnknownOption, match=r"history of a lesson.*symmetric=False"):
+        lesson("pushing", symmetric=True, env={"history": 2})
     with pytest.raises(UnknownOption, match=r"memory of a lesson.*'sweep' does not report"):
         lesson("picking", teacher="sweep", symmetric=False, memory=True)
     with pytest.raises(UnknownOption, match=r"symmetric.*memory=False"):
