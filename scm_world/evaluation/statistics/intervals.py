@@ -202,7 +202,7 @@ def crossed_interval(
         >>> rng = np.random.default_rng(0)
         >>> table = rng.normal(size=(5, 1)) + rng.normal(size=(1, 40))  # few runs decide
         >>> print(crossed_interval(table))
-        -0.06 [-0.99, 0.87]
+        0.04 [-0.49, 0.58]
     """
     from scipy.special import stdtrit
 
