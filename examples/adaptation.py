@@ -1,6 +1,6 @@
 """Which hidden cause has an agent learned to infer? Seven agents for a cart, a puck and a reacher.
 
-``python examples/adaptation.py cart`` trains and tests them with one seed, in about ten minutes;
+``python examples/adaptation.py cart`` trains and tests them with one seed, in some ten minutes;
 ``python examples/adaptation.py cart puck reacher --seeds 5 --out adaptation`` is the study. Killed,
 the same call resumes. It needs the extra ``train``. The page *Agents that adapt* says which
 criteria were fixed beforehand, and what came out.
@@ -217,7 +217,7 @@ def main(*arguments: str) -> None:
     parser.add_argument("tasks", nargs="*", default=["cart"], help=", ".join(TASKS))
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--steps", type=int, default=150_000, help="of each training")
-    parser.add_argument("--episodes", type=int, default=20, help="of each protocol and seed")
+    parser.add_argument("--episodes", type=int, default=20, help="of each protocol")
     parser.add_argument("--out", default="adaptation")
     given = parser.parse_args(arguments or None)
     folder = Path(given.out or tempfile.mkdtemp())

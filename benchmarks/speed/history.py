@@ -77,5 +77,6 @@ def draw(rows: list[Row], path: Path) -> None:
 def publish(rows: list[Row], page: Path, picture: Path) -> None:
     """Draw the picture, and show it on the page."""
     draw(rows, picture)
-    about = f"Figures of {len(rows)} runs over releases, one curve a machine; goals are dashed."
+    count = f"{len(rows)} run{'s' * (len(rows) != 1)}"
+    about = f"Figures of {count} over releases, one curve a machine; goals are dashed."
     put(f"![{about}](../images/{picture.name})\n\n{about}", page, "history")

@@ -17,11 +17,12 @@ from scm_world.evaluation.protocols import Protocol, protocols_of
 from scm_world.evaluation.recording import Recorder, Recording, record
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.statistics import Causes, Interval
-from scm_world.evaluation.verdicts import Change, Inferred, Probe
+from scm_world.evaluation.verdicts import CauseProbe, Change, Inferred
 
 __all__ = [
     "METRICS",
     "Adaptive",
+    "CauseProbe",
     "Causes",
     "Change",
     "Evaluation",
@@ -30,7 +31,6 @@ __all__ = [
     "Inferred",
     "Interval",
     "Otherwise",
-    "Probe",
     "Protocol",
     "Recorder",
     "Recording",

@@ -1,4 +1,4 @@
-"""An agent that fits parameters to its own episode, and acts as a policy that is told them."""
+"""An agent that fits parameters to its own episode, and acts as a policy that observes them."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ class Adaptive:
     declares, and what a fit does not determine stays as it was believed; with ``prior="A"`` it
     believes the mean of the posterior instead, however little was seen. The true values of the
     parameters, and of all parameters that follow from them, never reach the policy: in the
-    observation the believed ones are in their place. Give all that it should not be told as
-    ``parameters``; other variables are shown to it as they are.
+    observation the believed ones are in their place. Name all that it must not see as
+    ``parameters``; it sees other variables as they are.
 
     It does the same whatever the machine, since its budget is a number of steps of the fit.
 
@@ -56,7 +56,8 @@ class Adaptive:
         use: ``"mean"``: it acts by the fitted values; ``"draw"``: by a draw from what the fit
             leaves open, anew after each fit, from the noise of the episode.
         prior: ``"A"``, ``"B"`` or ``"A|B"``: parameters that have this space begin with its mean
-            and covariance, of which a fit makes those of a normal posterior; see ``posterior``.
+            and covariance, of which a fit makes those of a normal posterior; see ``posterior``. At
+            least one has it.
         keeps: Whether what it believes holds in the next episode, too, until ``forget`` is called:
             for draws of protocols that are repeated. Each fit is of one episode.
 
@@ -99,7 +100,7 @@ class Adaptive:
     ) -> None:
         inside = policy.policy if isinstance(policy, WorldPolicy) else policy
         self._planner = copy.copy(inside) if isinstance(inside, CrossEntropy) else None
-        self._told = {} if self._planner is None else dict(self._planner.do)
+        self._given = {} if self._planner is None else dict(self._planner.do)
         self._agent = as_agent(policy if self._planner is None else WorldPolicy(self._planner))
         self.parameters, self.measures = as_names(parameters), dict(measures)
         for name in ("parameters", "measures"):
@@ -128,7 +129,7 @@ class Adaptive:
         policy: Any = None if "sha256" in about else self._agent.policy
         if self._planner is not None:
             planner = {n: v for n, v in vars(self._planner).items() if n != "_programs"}
-            policy = {**planner, "do": self._told}
+            policy = {**planner, "do": self._given}
         form = None if self.card is None else self.card.env
         return {"policy": (about, policy, form), "fits": (self.parameters, self.measures, *how)}
 
@@ -139,7 +140,7 @@ class Adaptive:
         return {**state, "_env": None, "history": []}
 
     def start(self, env: ScmWorldEnv) -> None:
-        """Begin an episode, with the declared values of the parameters, unless it keeps others."""
+        """Begin an episode, with the first belief, unless it keeps what it believes."""
         if env is not self._env:
             self._prepare(env)
         if not self.keeps:
@@ -149,7 +150,7 @@ class Adaptive:
         self._agent.start(env)
 
     def forget(self) -> None:
-        """Believe the declared values of the parameters again."""
+        """Believe again the declared values, or the mean of the prior."""
         if self._env is not None:
             self._fit.begin()
             center = self._moments[0]
@@ -204,6 +205,10 @@ class Adaptive:
             raise UnknownOption(f"policy that does not observe {missing!r}", "this one", allowed)
         center, prior = moments(self._fit.targets, model, self.prior)
         own, sizes = ~np.isnan(center), np.ones(len(center))
+        if self.prior is not None and not own.any():
+            names = tuple(target.variable for target in self._fit.targets)
+            known = (f"a space that one of {', '.join(dict.fromkeys(names))} has", "None")
+            raise UnknownOption("prior", self.prior, known)
         sizes[own] = np.sqrt(np.diag(prior))
         self._fit.rescale(sizes)
         self._env, self._moments = env, moments(self._fit.targets, model, self.prior)
@@ -214,7 +219,7 @@ class Adaptive:
         values = values_of(self._fit.targets, scaled)
         self._seen = parts(self._shadow.reset(seed=0, options={"do": values})[0])
         if self._planner is not None:
-            self._planner.do = {**self._told, **values}
+            self._planner.do = {**self._given, **values}
         self._scaled = scaled
 
     def _as_believed(self, observation: Observation, steps: int) -> Observation:
@@ -244,6 +249,8 @@ class Adaptive:
                 known[own] = known[own].all()
             new, spread, center = fit.scaled.copy(), fit.spread.copy(), self._moments[0]
             with_prior = np.flatnonzero(~np.isnan(center))
+            # Where the residuals are like the noise, an end without convergence is taken for the
+            # minimum: what is left to go is in flat directions, and these the prior decides.
             if len(with_prior) and (fit.explains or not fit.ended):
                 square = np.ix_(with_prior, with_prior)
                 mean, rest = posterior(*self._moments, new[with_prior], spread[square])

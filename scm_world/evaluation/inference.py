@@ -42,9 +42,9 @@ from scm_world.evaluation.verdicts import (
     PARTS,
     SHUFFLED,
     UNTRAINED,
+    CauseProbe,
     Change,
     Inferred,
-    Probe,
 )
 from scm_world.policies.agents import Actions, Agent
 from scm_world.queries.progress import Progress
@@ -134,7 +134,7 @@ class _Twin(Hook):
 
 @final
 @dataclass
-class _Runner:
+class _EpisodeRunner:
     """Plays shards of episodes and their twins; keeps environments for the next one."""
 
     setup: Setup
@@ -221,9 +221,9 @@ def joined(rows: Sequence[Arrays], join: Callable[..., Floats] = np.stack) -> Ar
 
 def _probes(
     arrays: Arrays, columns: Sequence[str], steps: Sequence[int], logs: Sequence[bool]
-) -> tuple[list[Probe], dict[str, str]]:
+) -> tuple[list[CauseProbe], dict[str, str]]:
     """Fit the probes; return them, and why there are none of a column or a step."""
-    found, left_out = list[Probe](), dict[str, str]()
+    found, left_out = list[CauseProbe](), dict[str, str]()
     for place, step in enumerate(steps):
         reached = np.isfinite(arrays["causes"][:, place]).all(axis=1)
         causes = arrays["causes"][reached, place]
@@ -240,7 +240,7 @@ def _probes(
             for k, (own, by_chance) in zip(used, fitted, strict=True):
                 scores[k][name] = own
                 scores[k] |= {SHUFFLED: by_chance} if name == HIDDEN else {}
-        found += [Probe(columns[k], step, each) for k, each in scores.items()]
+        found += [CauseProbe(columns[k], step, each) for k, each in scores.items()]
     return found, left_out
 
 
@@ -364,7 +364,7 @@ def inferred(
     setup = prepare(agents, protocol, task, n, seed, backend, env, trusted)
     if len(setup.engines) > 1 or {*setup.agents} - {AGENT, PRIVILEGED}:
         raise UnknownOption("policy or backend", "several", ("one",))
-    with closing(_Runner(setup, (), (), (0, 0))) as runner:
+    with closing(_EpisodeRunner(setup, (), (), (0, 0))) as runner:
         here = runner.env(AGENT)
         length = min(here.limit, here.world.max_episode_length)
         wanted = [s for s in STEPS if s < length - 1] if steps is None else [*steps]
@@ -392,7 +392,7 @@ def inferred(
             size = int(np.prod(declared.shape))
             columns += [name] if size == 1 else [f"{name}[{k}]" for k in range(size)]
             logs += [getattr(source, "family", "") in LOGARITHMIC] * size
-    runner = _Runner(setup, names, probed, pair)
+    runner = _EpisodeRunner(setup, names, probed, pair)
     cells = {}
     for shard in setup.shards():
         if (shard.agent, shard.run) == AGENT:
@@ -400,7 +400,7 @@ def inferred(
             said = json.dumps([*keys, probed, runner.twins]).encode()
             cells[f"parts/{blake2b(said, digest_size=12).hexdigest()}.npz"] = shard
     arrays = _played(runner, cells, pool_of(engine, workers), out, progress or (lambda *_: None))
-    found, left_out = list[Probe](), dict[str, str]()
+    found, left_out = list[CauseProbe](), dict[str, str]()
     with single_threaded():
         if HIDDEN in arrays:
             found, left_out = _probes(arrays, columns, probed, logs)
@@ -424,7 +424,7 @@ def _drawing(variables: Any) -> Protocol:
 
 
 def _played(
-    runner: _Runner,
+    runner: _EpisodeRunner,
     cells: Mapping[str, Shard],
     pools: Any,
     out: Location | str | None,

@@ -197,9 +197,8 @@ class Evaluation:
         groups = frame.groupby([*KEYS], sort=False, as_index=False)
         for label in (one for columns in drawn_columns(frame).values() for one in columns):
             how[label] = "mean" if np.max(groups[label].nunique()[label]) > 1 else "first"
-        frame = groups.agg(how)
-        return replace(self, about={**self.about, "protocols": [*about.values()]}, frame=frame,
-                       rewards=None)  # fmt: skip
+        described = {**self.about, "protocols": [*about.values()]}
+        return replace(self, about=described, frame=groups.agg(how), rewards=None)
 
     def the(self, name: str, given: str | None) -> str:
         """Choose an agent or a backend; where there is only one it need not be named.
@@ -349,7 +348,7 @@ class Evaluation:
     ) -> Interval:
         """Estimate by how much the scores of a reference agent are higher, paired by draw.
 
-        A reference that is told what the agent has to find out says what there is to be gained.
+        A reference that observes what the agent has to find out says what there is to be gained.
         The interval is over draws and over the training runs of both, see ``crossed_interval``;
         ``difference`` has one over episodes of these runs.
 

@@ -28,7 +28,7 @@ PARTS = ("own", "reaction", "memory")
 
 @final
 @dataclass(frozen=True)
-class Probe:
+class CauseProbe:
     """How much of a cause can be read off the hidden state after some control steps.
 
     Attributes:
@@ -121,7 +121,7 @@ class Inferred:
     """
 
     about: Mapping[str, Any]
-    probes: tuple[Probe, ...]
+    probes: tuple[CauseProbe, ...]
     changes: tuple[Change, ...]
     left_out: Mapping[str, str] = field(default_factory=dict)
 
@@ -190,7 +190,7 @@ class Inferred:
             data = json.loads(read_text(located(path)), object_hook=_read)
             if data.pop("format") != FORMAT:
                 raise ValueError(f"it has not the format {FORMAT!r}")
-            made = {"probes": Probe, "changes": Change}
+            made = {"probes": CauseProbe, "changes": Change}
             for name, kind in made.items():
                 fields = [{k: v for k, v in one.items() if k != "verdict"} for one in data[name]]
                 data[name] = tuple(kind(**one) for one in fields)

@@ -149,7 +149,7 @@ def train(
         }
         with (
             Study(folder, "training", settings) as study,
-            opened_log(logs, folder, card, cast("Any", function)) as told,
+            opened_log(logs, folder, card, cast("Any", function)) as sink,
         ):
             say(f"Training {recipe}; on {backend}, seed {seed}, in {folder}")
             about: dict[str, Any] = {
@@ -158,7 +158,7 @@ def train(
                 "progress": progress,
                 "tell": say,
             }
-            about |= {"begun": first is not None, "log": told}
+            about |= {"begun": first is not None, "log": sink}
             if recipe.algo != "rsl_ppo":
                 about |= {"callback": own, "tensorboard": "tensorboard" in logs}
             score = library.learn(model, recipe, study, **about)

@@ -23,7 +23,7 @@ from scm_world.training.recipe import Recipe
 
 @final
 @dataclass(frozen=True)
-class Swept:
+class SearchResult:
     """A search that is over.
 
     Attributes:
@@ -51,7 +51,7 @@ def sweep(
     progress: Progress | None = None,
     tell: Tell | None = None,
     **options: Any,
-) -> Swept:
+) -> SearchResult:
     """Search for the values of a recipe with which the best policy has the highest score.
 
     Values are proposed by the tree-structured Parzen estimator of Optuna. Each trial is a training
@@ -126,7 +126,7 @@ def sweep(
         write_whole(folder / "sweep.csv", text.getvalue())
         if best is not None:
             write_whole(folder / "best.json", best.to_json())
-    return Swept(folder, tuple(shown), best, ranked[0]["score"] if ranked else None)
+    return SearchResult(folder, tuple(shown), best, ranked[0]["score"] if ranked else None)
 
 
 def _distribution(optuna: Any, name: str, given: object) -> Any:

@@ -197,6 +197,12 @@ def test_what_cannot_be_fitted_or_shown_is_refused() -> None:
         as_agent(Adaptive(blind, MASS, measures=MEASURES)).start(env)
     shown = cart()
     shown.reset(seed=0)
+    form = as_agent(lambda seen: seen[:1], env={**FORM, "include": ["hinge.damping"]})
+    damped = as_agent(Adaptive(form, "hinge.damping", measures=MEASURES, prior="A"))
+    env = cart(include=["hinge.damping"])
+    env.reset(seed=0)
+    with pytest.raises(UnknownOption, match=r"a space that one of hinge.damping has"):
+        damped.start(env)
     for error, parameters, measures in (
         (UnknownVariable, MASS, {"hinge.angle": 0.1}),
         (UnknownVariable, MASS, {"motor.force": 0.1}),
