@@ -77,6 +77,7 @@ DETERMINED = 0.25  # largest standard error of a determined combination: a share
 MISFIT = 1.5  # least residual that estimated noise does not explain, in standard deviations of it
 EXCESS = 1.1  # the same of given noise, if it is significant
 ALARM = 1e-3  # chance that given noise alone is significant in any column
+SERIAL = 1e-2  # chance that independent noise has a significant correlation in any column
 CORRELATED = 2.0  # standard errors of a correlation of residuals that is none of noise
 AWAY = 0.5  # of the spread of a state in the recording, at which it is far from rest
 WORSE = 1.1  # times the error of the unfitted world, with which a fit replays worse than it
@@ -265,15 +266,19 @@ class Fit:
         of χ² which noise alone exceeds in one of a thousand fits, whatever the number of columns:
         few rows are no misfit by chance. And they are more than 1.1 times the noise: in thousands
         of rows χ² also rejects the rounding of an engine, a noise that is given 1 % too small, and
-        every real machine. Noise that was not given has an error of its own, and models of real
-        machines leave residuals that follow one another: there the ``misfit`` is at least 1.5.
+        every real machine. Noise that was not given is the root mean square of the residuals, which
+        contains an error of the model. There residuals are too large if they are more than 1.1
+        times their ``roughness``, and follow one another as those of independent noise do in one of
+        a hundred fits; or if they are at least 1.5 times as large.
         """
-        from scipy.special import chdtri
+        from scipy.special import chdtri, ndtri
 
-        squares = by_column(self.measured.cells[1], self.residual**2, len(self.columns))[0]
-        most = chdtri(np.maximum(self.freedom, 1.0), ALARM / len(self.columns))
+        count = len(self.columns)
+        squares = by_column(self.measured.cells[1], self.residual**2, count)[0]
+        most = chdtri(np.maximum(self.freedom, 1.0), ALARM / count)
         size = np.array([*self.misfit.values()])
-        far = np.where(self.given, (squares > most) & (size > EXCESS), size >= MISFIT)
+        alike = (self._correlation > -ndtri(SERIAL / count)) & (size > EXCESS)
+        far = np.where(self.given, (squares > most) & (size > EXCESS), alike | (size >= MISFIT))
         return tuple(one.name for one, wrong in zip(self.columns, far, strict=True) if wrong)
 
     @property
@@ -281,16 +286,21 @@ class Fit:
         """Whether no column is ``unexplained``, so that the model can be true."""
         return not self.unexplained
 
-    @property
-    def correlated(self) -> bool:
-        """Whether consecutive residuals of a column are correlated, which noise is not.
+    @cached_property
+    def _correlation(self) -> Floats:
+        """Correlation of consecutive residuals of each column, in standard errors, (columns,).
 
         Source:
             von Neumann, see ``roughness``: the ratio has a standard deviation of about 1 : √n.
         """
         squares, count = by_column(self.measured.cells[1], self.residual**2, len(self.columns))
         ratio = self.roughness**2 / np.maximum(squares / count, 1e-300)
-        return bool((1.0 - ratio > CORRELATED / np.sqrt(count)).any())
+        return np.asarray((1.0 - ratio) * np.sqrt(count))
+
+    @property
+    def correlated(self) -> bool:
+        """Whether consecutive residuals of a column are correlated, which noise is not."""
+        return bool((self._correlation > CORRELATED).any())
 
     @cached_property
     def discount(self) -> float:

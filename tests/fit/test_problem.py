@@ -338,6 +338,25 @@ def test_a_term_that_is_missing_is_found_below_one_and_a_half_times_the_noise() 
     assert described(Minima(unknown), (0, 1), Minima(unknown).found((0, 1))).explains
 
 
+def test_residuals_that_follow_one_another_are_no_noise() -> None:
+    """A slow wave is found below 1.5 times the estimated noise; permuted rows have less order."""
+    wave, unknown = np.zeros((200, 3)), np.full(3, np.nan)
+    wave[:, 1] = 1.2 * NOISE[1] * np.sin(0.5 * np.arange(200))
+    asked = problem(more=wave, noise=unknown, rows=200)
+    fit = described(Minima(asked), (0, 1), Minima(asked).found((0, 1)))
+    left, rng = fit.residual[asked.measured.cells[1] == 1], np.random.default_rng(0)
+    order = np.array([left] + [rng.permutation(left) for _ in range(3000)])
+    order = (np.diff(order, axis=1) ** 2).sum(axis=1)
+    assert (order[1:] <= order[0]).mean() < 1e-2 / 3
+    assert 1.1 < fit.misfit["other"] < 1.5
+    assert fit.unexplained == ("other",)
+    alarms = 0
+    for seed in range(40):
+        asked = problem(seed=seed, noise=unknown)
+        alarms += not described(Minima(asked), (0, 1), Minima(asked).found((0, 1))).explains
+    assert alarms <= 2  # 0.5 % of 400
+
+
 @pytest.mark.parametrize("rows", [8, 60])
 def test_noise_alone_is_no_misfit(rows: int) -> None:
     """Right fits explain their recordings: 8 rows, of which some have 1.4 times their noise."""
