@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 
 from scm_world._types import Integers, Value
-from scm_world.errors import InterventionError
+from scm_world.errors import InterventionError, some
 from scm_world.models import Parameters
 from scm_world.variables import Intervention
 from scm_world.world.interventions import ROUNDING, Transaction, fixed_action, same
@@ -58,8 +58,9 @@ class Audit:
             whose mass or size changed [kg m²], before and after.
         came: Bodies that were added.
         went: Bodies that were removed.
-        remarks: Changes without effect on the physics, with the reason, and equality constraints
-            that are violated after the intervention has moved something, by how much.
+        remarks: Changes without effect on the physics, with the reason, moments of inertia that
+            stay where a mass is set, and equality constraints that are violated after the
+            intervention has moved something, by how much.
     """
 
     targets: Mapping[str, Applied]
@@ -238,6 +239,10 @@ def report(
     followed = {name: (np.array(old[name]), np.array(now[name])) for name in names}
     engine = {".".join(key): (was, reported[key]) for key, was in inertia.items()}
     there, were = ({*one.composition.bodies} for one in (compiled, old.compiled))
+    inertias = {name: name.removesuffix("mass") + "inertia" for name in asked}
+    still = [n for n in asked if n.endswith(".mass") and inertias[n] in compiled.parameter_keys]
+    if kept := [inertias[n] for n in still if same(old[inertias[n]], now[inertias[n]])]:
+        remarks += (f"{some(kept)} as before: '*.scale', if exposed, changes both",)
     if done.change is not None:
         remarks += (*_pulled(before, done),)
     return asked, followed, engine, (*sorted(there - were),), (*sorted(were - there),), remarks

@@ -432,7 +432,6 @@ SLIPPERY = """
         (0, {"ball.friction": 0.4}, "floor (1), cube (0.5)"),
         (1, {"cube.friction": 0.8}, "floor (1), ball (0.3)"),
         (1, {"ball.friction": 0.1}, ""),
-        (1, {"c.mass": 2.0}, ""),
     ],
 )
 def test_the_audit_says_where_a_friction_has_no_effect(
@@ -446,6 +445,20 @@ def test_the_audit_says_where_a_friction_has_no_effect(
     audit = world.do(request_)
     assert len(audit.remarks) == bool(decide)
     assert (f"note: {expected}" in str(audit)) == bool(decide)
+
+
+def test_the_audit_says_that_the_inertia_stays_where_a_mass_is_set() -> None:
+    """As in plain MuJoCo, body_mass is one number; a factor changes both."""
+    world = World(SLIPPERY.format(priority=0), expose=["*", "*.scale"])
+    world.reset(seed=0)
+    before = world["c.inertia"]
+    audit = world.do({"c.mass": 2.0})
+    assert (world["c.inertia"] == before).all()
+    assert audit.remarks == ("c.inertia as before: '*.scale', if exposed, changes both",)
+    assert world.do({"c.mass": 3.0, "c.inertia": 2.0 * before}).remarks == ()
+    world.reset(seed=0)
+    assert world.do({"c.scale": 2.0}).remarks == ()
+    np.testing.assert_allclose(world["c.inertia"], 2.0 * before)
 
 
 class Inside(BackendWrapper):
