@@ -386,7 +386,7 @@ def explain(
         metric: Score that is explained. By default last_fractional_success, or success or return
             where a task has none.
         versus: Value of the variable instead: A (from the training support) or default.
-        inferred: An inferred.json of 'scm-world infer' for this agent: variables that matter and
+        inferred: What 'scm-world infer' has written for this agent: variables that matter and
             that it does not infer are marked.
     """
     from scm_world.evaluation import Evaluation, Inferred, why

@@ -12,6 +12,7 @@ import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from itertools import product
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast, final
 
 import numpy as np
@@ -140,7 +141,8 @@ class Chart:
         from matplotlib.lines import Line2D
 
         handles = handles or [Line2D([], [], **look) for look in self.lines.values()]
-        title = f"{self.evaluation.task}: {self.metric_words}"
+        task = Path(self.evaluation.task).name.rpartition(":")[2]  # without the file of a class
+        title = f"{task}: {self.metric_words}"
         head, notes = textwrap.wrap(title, int(8 * width)), textwrap.wrap(note, int(13 * width))
         longest = max(len(row) for h in handles for row in str(h.get_label()).split("\n"))
         columns = max(1, int(width / (0.8 + 0.08 * longest)))

@@ -181,13 +181,15 @@ class Inferred:
 
     @classmethod
     def load(cls, path: Location | str) -> Inferred:
-        """Read a file of ``save``.
+        """Read a file of ``save``, or ``inferred.json`` in a folder of ``scm-world infer``.
 
         Raises:
             UnreadableFile: It is damaged, or something else.
         """
         with reading(path, "give a file that Inferred.save or scm-world infer has written"):
-            data = json.loads(read_text(located(path)), object_hook=_read)
+            place = located(path)
+            place = place / "inferred.json" if place.is_dir() else place
+            data = json.loads(read_text(place), object_hook=_read)
             if data.pop("format") != FORMAT:
                 raise ValueError(f"it has not the format {FORMAT!r}")
             made = {"probes": CauseProbe, "changes": Change}

@@ -15,6 +15,7 @@ from scm_world.env.vector import WIDE, bounds
 from scm_world.errors import InterventionError, UnknownOption
 from scm_world.geometry.rotations import from_rotation_vector, rotation_matrix
 from scm_world.graph import SCM
+from scm_world.policies import PolicyAbout
 from scm_world.tasks.trifinger.cameras import CAMERAS
 from scm_world.variables import Box, Derived, Exogenous, Linear
 from scm_world.variables.spaces import Affine, Switch
@@ -136,8 +137,12 @@ def test_a_context_can_be_some_parameters(history: int) -> None:
     np.testing.assert_array_equal(beside["observation"], bare)
     np.testing.assert_array_equal(beside["context"], seen[56 : 56 + len(wanted)])
     assert len(every["context"]) > len(beside["context"])
-    one, _ = make(context="floor_friction", **both).reset(seed=0)
-    assert len(one) == len(bare) + 1 + history
+    one = make(context="floor_friction", **both)
+    assert len(one.reset(seed=0)[0]) == len(bare) + 1 + history
+    for same in (["floor_friction"], {"observation": "floor_friction"}):  # for policy files, too
+        other = make(context=same, **both).unwrapped
+        assert other.made_with == one.unwrapped.made_with
+        PolicyAbout.in_env(one).check(other, "it")
 
 
 @pytest.mark.parametrize(

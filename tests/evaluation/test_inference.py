@@ -312,7 +312,8 @@ def test_the_command_writes_and_explain_reads(tmp_path: Path) -> None:
     done = call([*given, "--workers=1", f"--out={tmp_path}"])
     assert done.exit_code == 0, done.output
     assert "no change" in done.output
-    found = Inferred.load(tmp_path / "inferred.json")
+    found = Inferred.load(tmp_path)
+    assert found.as_dict() == Inferred.load(tmp_path / "inferred.json").as_dict()
     assert (found.about["steps"], found.about["twins"]) == ([3, -1], [2, 3])
     evaluate(agent, "A", task=task, n=20, env=FROM_REST).save(tmp_path)
     given = ["explain", str(tmp_path), f"--inferred={tmp_path / 'inferred.json'}"]
