@@ -269,7 +269,7 @@ def _remember(model: BaseAlgorithm, path: Path) -> None:
 
 
 def restore(model: BaseAlgorithm, content: bytes, steps: int, memory: Path) -> str:
-    """Restore what ``save_checkpoint`` wrote, and the number of steps.
+    """Restore what ``save_checkpoint`` wrote, and the number of steps; other episodes follow.
 
     Only tensors and arrays are read, which runs no code.
 
@@ -283,6 +283,8 @@ def restore(model: BaseAlgorithm, content: bytes, steps: int, memory: Path) -> s
     for name, tensor in (variables or {}).items():
         recursive_setattr(model, f"{name}.data", tensor.data.to(model.device))
     model.num_timesteps = steps
+    model.set_random_seed((seed := model.seed or 0) + steps)
+    model.get_env().seed((seed + 1) * SEEDS + steps)
     if hasattr(model, "clip_range") and not callable(model.learning_rate):
         model.learning_rate = model.policy.optimizer.param_groups[0]["lr"]  # it may adapt
         model._setup_lr_schedule()

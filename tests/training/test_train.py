@@ -152,8 +152,15 @@ def test_a_training_goes_on_with_what_it_remembers(name: str, tmp_path: Path) ->
         algorithms.resume(model, study, said.append)
         return model
 
+    def begun() -> Any:
+        seen = worlds.reset()
+        return seen["observation"] if isinstance(seen, dict) else seen
+
+    algorithms.make_learner(recipe, worlds, seed=3)
+    first = begun()
     model = resumed()
     assert said == ["goes on after 128 steps"]
+    assert not np.array_equal(first, begun())  # other episodes
     if name == "ppo":
         assert model.get_vec_normalize_env().ret_rms.count > 100
     else:
