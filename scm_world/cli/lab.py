@@ -71,7 +71,7 @@ def question(asked: QuestionOptions) -> None:
 
 
 def run(asked: QuestionOptions, *, agent: str = "random", out: options.Text = None) -> None:
-    """Let a scripted agent answer a question, and print its score.
+    """Run a scripted agent on a question, and print its score.
 
     Example: scm-world lab run --kind effect --world springs --seed 3 --agent random
 

@@ -125,7 +125,7 @@ def comparison(result: BenchmarkResult) -> Any:
 
 
 def trivial_answers(result: BenchmarkResult) -> list[str]:
-    """Say for which problems and data no learner is better than the best trivial baseline."""
+    """List for which problems and data no learner is better than the best trivial baseline."""
     found, rows = [], comparison(result)
     rows = rows[rows.trivial & (rows.budget == rows.budget.max())]
     for (name, data), each in rows.groupby(KEYS[:2], sort=False):

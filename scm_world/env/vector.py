@@ -257,7 +257,7 @@ class Vector:
         return found
 
     def _turn(self, found: NDArray[np.float32]) -> None:
-        """Give quaternions (x, y, z, w) the signs of the predecessor, shape (m, n).
+        """Set the signs of quaternions (x, y, z, w) to those of the predecessor, shape (m, n).
 
         Its backend reads them from a rotation matrix: w is positive where its trace is, up to 120°;
         beyond, the greatest of the other three is.

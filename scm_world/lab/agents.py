@@ -584,7 +584,7 @@ AGENTS: Mapping[str, Callable[[Laboratory], None]] = {
 
 
 def play(agent: str, question: Question) -> Laboratory:
-    """Let a scripted agent answer a question, and return its laboratory.
+    """Run a scripted agent on a question, and return its laboratory.
 
     Raises:
         UnknownOption: There is no such agent.

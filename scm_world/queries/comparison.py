@@ -254,7 +254,7 @@ def _gaps(
     horizons: Sequence[int],
     seed: int,
 ) -> tuple[tuple[Gap, ...], int]:
-    """Let both go on from the same numbers, with the same actions.
+    """Continue both from the same numbers, with the same actions.
 
     The action of a start is held for ``HELD`` control steps, then random ones are.
 

@@ -58,7 +58,7 @@ def piped(
 
 @contextmanager
 def _deaf() -> Iterator[None]:
-    """Let processes that are started meanwhile inherit that Ctrl-C is ignored."""
+    """Ignore Ctrl-C in processes that are started meanwhile."""
     if sys.platform == "win32":
         from ctypes import windll
 

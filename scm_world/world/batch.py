@@ -877,7 +877,7 @@ class Batch(WorldsInRows):
         return [(self._kinds[n], rows[kinds == n]) for n in dict.fromkeys(kinds.tolist())]
 
     def _fill(self, row: int) -> None:
-        """Let a world use its row in the table of its structure."""
+        """Assign a world its row in the table of its structure."""
         world = self._alone(row)
         world._require_episode()
         self._kind[row] = self._number((world.compiled, world.substeps))

@@ -543,7 +543,7 @@ class CompiledTask(Vectors):
 
 
 def _after_commands(variables: list[Variable]) -> Iterator[Variable]:
-    """Give what is computed from a command the one of the control step before, with lag 1.
+    """Replace commands by those of the control step before, with lag 1, in what they compute.
 
     An instant is computed when its command has not been chosen.
     """

@@ -748,7 +748,7 @@ class Simulation(CausalSystem):
         self.backend.close()
 
     def _lose(self, why: str) -> None:
-        """Let the world have no state to continue from, until a reset or a snapshot."""
+        """Clear the state that the world would continue from, until a reset or a snapshot."""
         self._lost = why
 
     def require_exact(self, question: str, *, independent: bool = False) -> None:

@@ -335,7 +335,7 @@ def _notes(mj: mujoco.MjModel, keyframe: str | int | None, staged: bool) -> Iter
 
 
 def _odd(rows: Iterable[Parameter]) -> Iterator[str]:
-    """Say which values of a file lie beyond the ends that such a quantity has in physics."""
+    """List which values of a file lie beyond the ends that such a quantity has in physics."""
     found = []
     for row in rows:
         least = np.broadcast_to(row.low, row.shape)  # a value below its end is the lower bound

@@ -58,7 +58,7 @@ def kept(function: Callable[[Any], T]) -> Callable[[Any], T]:
 
 
 def silent(data: mujoco.MjData) -> mujoco.MjData:
-    """Let MuJoCo print no warnings about data: it prints the first one of each kind."""
+    """Suppress warnings of MuJoCo about data: it prints the first one of each kind."""
     data.warning.number[:] = 1
     return data
 

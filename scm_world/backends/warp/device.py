@@ -99,7 +99,7 @@ class _CompilerMessages:
 
 @contextmanager
 def quiet(device: str = "", *, compiles: bool = False) -> Iterator[None]:
-    """Let Warp say nothing; where it compiles, tell so."""
+    """Silence Warp; where it compiles, print that it does."""
     level, logger = wp.config.log_level, get_logger()
     listener = _CompilerMessages(device)
     wp.config.log_level = wp.LOG_INFO if compiles else wp.LOG_ERROR

@@ -142,7 +142,7 @@ class Group:
     # --- parameters ----------------------------------------------------------------------------
 
     def adopt(self, slots: Integers, constants: Constants) -> None:
-        """Give some scenes the same constants."""
+        """Set the constants of some scenes to the same ones."""
         for name in constants.rows.keys() - self._fields.keys():
             usual = self.derive.defaults[name][None]
             self._fields[name] = np.repeat(usual, len(self.rows), axis=0)
@@ -599,7 +599,7 @@ class WarpScenes(Scenes):
     def _rebuild(
         self, index: int, structure: Structure, parameters: Parameters, vector: Floats | None
     ) -> None:
-        """Give a scene another structure."""
+        """Set the structure of a scene."""
         before, there = self._at(index)
         state = before.structure.empty_state().with_vector(before.read(np.array([there]))[0])
         now = Scene(before.structure, before.all_parameters(there), state)
