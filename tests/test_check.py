@@ -875,6 +875,17 @@ def test_what_cannot_be_set_is_not_asked() -> None:
         check(envs, MASS, by="set")
 
 
+def test_a_package_of_an_environment_that_is_missing_is_named(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Gymnasium's MuJoCo environments import what its extra ``mujoco`` brings."""
+    lost = gymnasium.envs.registration.EnvSpec("Lost-v0", entry_point="not_there_9:Lost")
+    monkeypatch.setitem(gymnasium.registry, "Lost-v0", lost)
+    found = CliRunner().invoke(app, ["check", "Lost-v0"])
+    assert found.exit_code == 2
+    assert "needs the package 'not_there_9'" in found.output, found.output
+
+
 def test_the_command_exits_1_for_a_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of an environment of Gymnasium, of a function and of a task; files are written."""
     monkeypatch.chdir(tmp_path)
