@@ -339,8 +339,9 @@ def strength_figure(evaluation: Evaluation, metric: str | None = None) -> Figure
     """Draw the mean score by the drawn value of each cause: a panel for each number that is drawn.
 
     Episodes are binned by that number, ten or more in a bin. They are those of the protocols that
-    draw nothing else; if there is none, of the protocol that draws the fewest others with it, and
-    these numbers come last. Shaded is where the values of protocols with space A and B lie. The
+    draw nothing else; if there is none, of those that draw the same others with it, the fewest, and
+    these numbers come last. What every episode draws, such as start states, has panels where no
+    protocol varies anything. Shaded is where the values of protocols with space A and B lie. The
     first twelve are drawn.
 
     Raises:
@@ -348,11 +349,12 @@ def strength_figure(evaluation: Evaluation, metric: str | None = None) -> Figure
     """
     chart, drawn, frame = Chart(evaluation, metric), _drawn(evaluation), evaluation.by_draw.frame
     about = {one["name"]: one for one in evaluation.about.get("protocols", ())}
+    varying = [one for one in drawn if about[one].get("varies") != []]
     panels: dict[tuple[str, int], list[str]] = {}  # protocols, by column and control step
-    for protocol in sorted(drawn, key=lambda one: len(drawn[one])):
+    for protocol in sorted(varying or drawn, key=lambda one: len(drawn[one])):
         for column in drawn[protocol]:
             mine = panels.setdefault((column, about[protocol]["step"]), [])
-            if not mine or len(drawn[protocol]) == len(drawn[mine[0]]) == 1:
+            if not mine or drawn[protocol] == drawn[mine[0]]:
                 mine.append(protocol)
     if not panels:
         raise UnknownOption("protocols", evaluation.protocols, ("one that draws a variable",))

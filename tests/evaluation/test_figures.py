@@ -312,6 +312,18 @@ def test_strength_has_the_mean_score_of_each_bin() -> None:
     assert_readable(figure)
 
 
+def test_strength_has_all_protocols_that_draw_the_same_numbers() -> None:
+    """P1 and P2 draw mass and friction together: a panel for each, with the episodes of both."""
+    evaluation = made(2, 3, n=40, kept=lambda row: row["protocol"] in ("P0", "P1", "P2"))
+    both = ["tool_block.mass", "floor_friction"]
+    named_so = [{**one, "varies": both if one["name"] in ("P1", "P2") else one["varies"]}
+                for one in evaluation.about["protocols"]]  # fmt: skip
+    evaluation = replace(evaluation, about={**evaluation.about, "protocols": named_so})
+    panels = strength_figure(evaluation).axes
+    assert len(panels) == 2
+    assert all(ax.get_title().endswith("(P1, P2)") for ax in panels)
+
+
 def test_regret_has_the_difference_of_the_means() -> None:
     """Rows are the protocols that vary one variable, columns all agents but the reference."""
     evaluation = made(3, 9)
