@@ -69,6 +69,16 @@ def test_a_training_writes_what_others_write(tmp_path: Path) -> None:
     assert not np.array_equal(weights[0]["layers.0.weight"], weights[2]["layers.0.weight"])
 
 
+def test_levels_have_their_gap(tmp_path: Path) -> None:
+    """Trials have the scores on the levels and on new draws, as those of other algorithms do."""
+    made = RECIPE.but(levels=3, curriculum="P5", steps=128)
+    found = train(made, out=tmp_path, **GIVEN)
+    trials = [json.loads(one.read_text()) for one in tmp_path.glob("evaluations/*.json")]
+    assert found.steps == 128
+    assert all(one["gap"] == one["training_levels"] - one["new_draws"] for one in trials)
+    assert len(trials) == 2
+
+
 def test_what_was_killed_goes_on_from_the_last_checkpoint(tmp_path: Path) -> None:
     """With its weights and its scale of rewards; another seed is refused."""
     program = f"""

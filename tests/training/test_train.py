@@ -21,7 +21,7 @@ import pytest
 import safetensors.numpy
 
 from scm_world._arguments import missing
-from scm_world.curricula import CurriculumEnv, stages
+from scm_world.curricula import CurriculumEnv, make_vec, stages
 from scm_world.curricula.curriculum import as_curriculum
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import (
@@ -444,6 +444,17 @@ def test_levels_are_a_fixed_set_of_episodes(tmp_path: Path) -> None:
             shown, _ = env.reset(seed=level_seed(3), options={"episode": level})
             wanted.append(shown[layout["goal_block.cartesian_position"]])
     assert {*map(tuple, goals.tolist())} == {*map(tuple, np.array(wanted).tolist())}
+
+    many: dict[str, Any] = {"levels": 3, "level_seed": level_seed(3), "backend": "fake"}
+    seen = []
+    for how in ({"threads": 1}, {"workers": 2}):
+        mode = gymnasium.vector.AutoresetMode.SAME_STEP
+        with closing(make_vec("scm_world/Pushing-v0", 4, curriculum, **how, **many,
+                              autoreset_mode=mode, max_episode_length=9)) as envs:  # fmt: skip
+            seen.append(
+                [envs.reset(seed=0)[0], *(envs.step(np.zeros((4, 9)))[0] for _ in range(30))]
+            )
+    np.testing.assert_array_equal(*seen)  # levels come in the same order from processes
 
     found = run(made, tmp_path / "run")
     card: Any = load_policy(found.best).about.card["trial"]
