@@ -103,6 +103,12 @@ class Evaluation:
     def __len__(self) -> int:
         return len(self.frame)
 
+    def __str__(self) -> str:
+        metric, lines = self.metric(), ["agent", "engine"][: min(len(self.engines), 2)]
+        table = self.frame.pivot_table(metric, "protocol", lines, sort=False)
+        about = f"{len(self):,} episodes of {self.task}, mean {metric.replace('_', ' ')}"
+        return f"{about}\n{table.to_string(float_format='{:.3f}'.format)}"
+
     def __eq__(self, other: object) -> bool:
         """Return whether both have the same rows; the order of columns does not matter."""
         if not isinstance(other, Evaluation) or {*self.frame} != {*other.frame}:

@@ -301,6 +301,14 @@ class Samples(Mapping[str, Floats]):
             found |= {f"{name}[{i}]" if len(parts) > 1 else name: p for i, p in enumerate(parts)}
         return pd.DataFrame(found, index=pd.Index(self.numbers, name="episode"))
 
+    def __str__(self) -> str:
+        table = (
+            self.frame()
+            .agg(["mean", "std", "min", "max"])
+            .T.to_string(float_format="{:.4g}".format)
+        )
+        return f"{len(self.numbers):,} episodes of seed {self.seed}, {self.plan}\n{table}"
+
 
 def refuse_late(plan: Plan, steps: int) -> None:
     """Refuse interventions that are later than the end of the episode."""

@@ -62,6 +62,14 @@ def test_paired_differences_are_surer() -> None:
         Evaluation({}, pandas.DataFrame(rows[:-1])).difference("b", "a", "P1")
 
 
+def test_it_is_printed_as_a_table_of_means() -> None:
+    """A row for each protocol and a column for each agent, not all arrays."""
+    rows = by_hand([0.25, 0.75], agent="a") + by_hand([1.0, 0.5], agent="b")
+    title, _, _, means = str(Evaluation({"task": "reaching"}, pandas.DataFrame(rows))).splitlines()
+    assert title == "4 episodes of reaching, mean last fractional success"
+    assert means.split() == ["P1", "0.500", "0.750"]
+
+
 def test_several_runs_of_an_agent_count_once_an_episode() -> None:
     """All of them met the same draws; IQM and the rest are over the runs."""
     found = small({"mine": ["still", "random", "sweep"], "other": linear})

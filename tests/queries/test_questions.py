@@ -234,6 +234,8 @@ def test_a_model_without_lags_has_episodes_of_one_instant() -> None:
     """Their values are those that are drawn from the model."""
     model, drawn = chain(), chain().draw(50, seed=4)
     found = model.sample(50, seed=4)
+    (row,) = (line.split() for line in str(found).splitlines() if line.startswith("z "))
+    assert row[1:3] == [f"{found['z'].mean():.4g}", f"{found['z'].std(ddof=1):.4g}"]
     for name in model:
         np.testing.assert_array_equal(found[name], drawn[name])
     episode = model.rollout(seed=4, episode=17)
