@@ -885,6 +885,15 @@ def test_a_package_of_an_environment_that_is_missing_is_named(
     assert found.exit_code == 2
     assert "needs the package 'not_there_9'" in found.output, found.output
 
+    def made(**options: Any) -> Any:
+        raise gymnasium.error.DependencyNotInstalled("Box2D is not installed")
+
+    lost = gymnasium.envs.registration.EnvSpec("Lost-v0", entry_point=made)
+    monkeypatch.setitem(gymnasium.registry, "Lost-v0", lost)
+    found = CliRunner().invoke(app, ["check", "Lost-v0"])
+    assert found.exit_code == 2
+    assert "Lost-v0 cannot be made: Box2D is not installed" in found.output, found.output
+
 
 def test_the_command_exits_1_for_a_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of an environment of Gymnasium, of a function and of a task; files are written."""

@@ -370,7 +370,7 @@ def explain(
     backend: options.Text = None,
     metric: options.Text = None,
     versus: options.Text = None,
-    inferred: Annotated[str | None, typer.Option(metavar="FILE")] = None,
+    inferred: Annotated[str | None, typer.Option(metavar="PATH")] = None,
     trust: options.Words = None,
 ) -> None:
     """Print which variables decided the scores, or the counterfactuals of one episode.

@@ -14,7 +14,7 @@ import scm_world as sw
 from scm_world._arguments import load, one_of
 from scm_world.cli import console, options
 from scm_world.cli.options import load_system, parse_assignments, parse_outcome, tag
-from scm_world.errors import MissingExtra, ScmWorldError, UnknownOption, UnreadableFile
+from scm_world.errors import MissingExtra, ModelError, ScmWorldError, UnknownOption, UnreadableFile
 from scm_world.runs.canvas import png
 from scm_world.runs.files import write_whole
 
@@ -415,6 +415,8 @@ def _many(source: str, count: int, asked: options.Asked) -> Any:
             return gymnasium.make_vec(source, count, vectorization_mode="sync")
         except ModuleNotFoundError as error:  # such as imageio, of gymnasium[mujoco]
             raise MissingExtra(error.name or source) from None
+        except (ImportError, gymnasium.error.Error) as error:
+            raise ModelError([f"{source} cannot be made: {error}"]) from None
     if ":" in source:
         made = made_from(source, options.task_arguments(asked.option))
         if not isinstance(made, sw.Task | sw.SCM):

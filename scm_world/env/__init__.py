@@ -8,7 +8,8 @@ from scm_world.env.batch import ScmWorldVectorEnv
 from scm_world.env.checks import Check, check
 from scm_world.env.environment import ENV_OPTIONS, ScmWorldEnv
 from scm_world.env.models import MODEL_ID, make_env, vector_env
-from scm_world.env.observer import CONTEXTS, MODES
+from scm_world.env.observer import MODES
+from scm_world.policies.cards import CONTEXTS
 
 IDS = {
     name: str(spec.kwargs["task"])

@@ -31,7 +31,7 @@ from scm_world.env.arguments import (
     reset_options,
 )
 from scm_world.env.history import History
-from scm_world.env.observer import EVERY, FAILED, Observer, check_options, context_of
+from scm_world.env.observer import FAILED, Observer, check_options
 from scm_world.env.pictures import Cameras, has_screen, height_and_width, read_camera
 from scm_world.env.vector import Vector
 from scm_world.errors import (
@@ -326,12 +326,8 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
 
     @property
     def made_with(self) -> dict[str, Any]:
-        """The options that it was made with, by name; equal forms of ``context`` in one of them."""
-        found = dict(self._ezpickle_kwargs)
-        mode, names = context_of(found["context"])
-        if names != EVERY:
-            found["context"] = names if mode == "observation" else {mode: names}
-        return found
+        """The options that it was made with, by name."""
+        return dict(self._ezpickle_kwargs)
 
     @property
     def spec(self) -> EnvSpec | None:

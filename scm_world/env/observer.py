@@ -17,6 +17,7 @@ from scm_world.env.history import History
 from scm_world.env.pictures import Pixels
 from scm_world.env.vector import KEYPOINTS, WIDE, ObservedPart, Vector, bounds, spread
 from scm_world.errors import InterventionError, UnknownOption
+from scm_world.policies.cards import CONTEXTS, EVERY, context_of
 from scm_world.tasks import Observed
 from scm_world.tasks.model import REWARD
 from scm_world.tasks.rewards import FRACTION, SUCCESS, TERMINATED
@@ -98,36 +99,12 @@ class GoalVectors:
 
 
 MODES = ("structured", "full", "pixel", "custom")
-CONTEXTS = ("none", "observation", "privileged")
 
 LONGEST = 1_000
 """Most pairs of a history."""
 
-EVERY = ("*",)
-"""The pattern of all parameters."""
-
 FAILED = "failed"
 """What ``info`` calls an episode that ends since its world failed, with ``on_failure``."""
-
-
-def context_of(given: Any) -> tuple[str, tuple[str, ...]]:
-    """Return where the option ``context`` has parameters, and their names and patterns.
-
-    Example:
-        >>> context_of("privileged"), context_of({"privileged": "*.mass"})
-        (('privileged', ('*',)), ('privileged', ('*.mass',)))
-    """
-    if isinstance(given, str) and given in CONTEXTS:
-        return given, EVERY
-    mode, names = "observation", given
-    if isinstance(given, Mapping):
-        (mode, names) = next(iter(given.items()), ("", ()))
-    wanted = as_names(names) if isinstance(names, Iterable) else ()
-    is_text = bool(wanted) and all(isinstance(name, str) for name in wanted)
-    if not is_text or mode not in CONTEXTS[1:] or (isinstance(given, Mapping) and len(given) > 1):
-        allowed = (*CONTEXTS, "names or patterns of parameters", "{'privileged': names}")
-        raise UnknownOption("context", given, allowed)
-    return mode, wanted
 
 
 def check_options(how: Mapping[str, Any]) -> None:

@@ -29,7 +29,15 @@ from scm_world.evaluation.protocols import Protocol, chosen, named, protocols_of
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.setups import Setup, several
 from scm_world.policies.agents import Agent, agent_from, as_agent
-from scm_world.policies.cards import ANY, COMMON, FORM, FREE, as_json, contradiction, usual
+from scm_world.policies.cards import (
+    ANY,
+    COMMON,
+    FORM,
+    FREE,
+    contradiction,
+    option_form,
+    usual,
+)
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import FORMAT, Plan
 from scm_world.tasks import AnySource, Task, make_task, tasks
@@ -213,7 +221,11 @@ def shared_options(given: Mapping[str, Any] | None, agents: Agents) -> dict[str,
     for option in (*FORM, *COMMON) if all_say else COMMON:
         for name, card in trained:
             wanted = card.option(option)
-            if option in found and wanted is not None and as_json(found[option]) != wanted:
+            if (
+                option in found
+                and wanted is not None
+                and option_form(option, found[option]) != wanted
+            ):
                 raise contradiction(option, found[option], wanted, name)
     if all_say:
         found = {option: value for option, value in found.items() if option not in FORM}

@@ -105,7 +105,7 @@ class Evaluation:
 
     def __str__(self) -> str:
         metric, lines = self.metric(), ["agent", "engine"][: min(len(self.engines), 2)]
-        table = self.frame.pivot_table(metric, "protocol", lines, sort=False)
+        table = self.frame.groupby(["protocol", *lines], sort=False)[metric].mean().unstack(lines)
         about = f"{len(self):,} episodes of {self.task}, mean {metric.replace('_', ' ')}"
         return f"{about}\n{table.to_string(float_format='{:.3f}'.format)}"
 

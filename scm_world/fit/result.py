@@ -291,11 +291,13 @@ class Fit:
         """Correlation of consecutive residuals of each column, in standard errors, (columns,).
 
         Source:
-            von Neumann, see ``roughness``: the ratio has a standard deviation of about 1 : √n.
+            von Neumann, see ``roughness``: of n pairs, the ratio has a standard deviation of about
+            1 : √n.
         """
         squares, count = by_column(self.measured.cells[1], self.residual**2, len(self.columns))
         ratio = self.roughness**2 / np.maximum(squares / count, 1e-300)
-        return np.asarray((1.0 - ratio) * np.sqrt(count))
+        pairs = np.bincount(self._pairs[2], minlength=len(self.columns))
+        return np.asarray((1.0 - ratio) * np.sqrt(pairs))
 
     @property
     def correlated(self) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from functools import partial
 from types import MappingProxyType
 from typing import Any, Literal, Protocol, Self, cast, final
@@ -15,6 +16,7 @@ from pydantic import Field, JsonValue, ValidationError, field_validator
 from pydantic_core import to_jsonable_python
 
 from scm_world._arguments import plain
+from scm_world._patterns import as_names
 from scm_world._types import ArrayLike, Observation
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.tasks import tasks
@@ -61,7 +63,41 @@ OPTIONS = tuple(USUAL)
 
 
 as_json = partial(to_jsonable_python, fallback=plain)
-"""Return options as JSON has them, for comparisons."""
+"""Return options as JSON has them."""
+
+CONTEXTS = ("none", "observation", "privileged")
+
+EVERY = ("*",)
+"""The pattern of all parameters."""
+
+
+def context_of(given: Any) -> tuple[str, tuple[str, ...]]:
+    """Return where the option ``context`` has parameters, and their names and patterns.
+
+    Example:
+        >>> context_of("privileged"), context_of({"privileged": "*.mass"})
+        (('privileged', ('*',)), ('privileged', ('*.mass',)))
+    """
+    if isinstance(given, str) and given in CONTEXTS:
+        return given, EVERY
+    mode, names = "observation", given
+    if isinstance(given, Mapping):
+        (mode, names) = next(iter(given.items()), ("", ()))
+    wanted = as_names(names) if isinstance(names, Iterable) else ()
+    is_text = bool(wanted) and all(isinstance(name, str) for name in wanted)
+    if not is_text or mode not in CONTEXTS[1:] or (isinstance(given, Mapping) and len(given) > 1):
+        allowed = (*CONTEXTS, "names or patterns of parameters", "{'privileged': names}")
+        raise UnknownOption("context", given, allowed)
+    return mode, wanted
+
+
+def option_form(name: str, given: object) -> JsonValue:
+    """Return an option of the environment as JSON, for comparisons: equal contexts are equal."""
+    if name == "context":
+        with suppress(UnknownOption):
+            mode, names = context_of(given)
+            return mode if names == EVERY else {mode: [*names]}
+    return cast("JsonValue", as_json(given))
 
 
 class PolicyEnv(Protocol):
@@ -144,7 +180,7 @@ class PolicyAbout(Frozen):
         for name in env:
             if name not in OPTIONS:
                 raise ValueError(f"{name!r} is not one of the options {', '.join(OPTIONS)}")
-        return as_json(env)
+        return {name: option_form(name, given) for name, given in env.items()}
 
     @field_validator("inputs")
     @classmethod
@@ -220,7 +256,7 @@ class PolicyAbout(Frozen):
             UnknownOption: An option differs from that of the training.
         """
         for option in (*FORM, *COMMON):
-            given, wanted = as_json(env.made_with[option]), self.option(option)
+            given, wanted = option_form(option, env.made_with[option]), self.option(option)
             if wanted is not None and given != wanted:
                 raise contradiction(option, given, wanted, name)
 

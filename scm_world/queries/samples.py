@@ -305,7 +305,7 @@ class Samples(Mapping[str, Floats]):
         table = (
             self.frame()
             .agg(["mean", "std", "min", "max"])
-            .T.to_string(float_format="{:.4g}".format)
+            .T.to_string(max_rows=60, float_format="{:.4g}".format)
         )
         return f"{len(self.numbers):,} episodes of seed {self.seed}, {self.plan}\n{table}"
 

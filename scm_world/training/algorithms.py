@@ -283,7 +283,7 @@ def restore(model: BaseAlgorithm, content: bytes, steps: int, memory: Path) -> s
     for name, tensor in (variables or {}).items():
         recursive_setattr(model, f"{name}.data", tensor.data.to(model.device))
     model.num_timesteps = steps
-    model.set_random_seed((seed := model.seed or 0) + steps)
+    model.set_random_seed(((seed := model.seed or 0) + steps) % 2**32)
     model.get_env().seed((seed + 1) * SEEDS + steps)
     if hasattr(model, "clip_range") and not callable(model.learning_rate):
         model.learning_rate = model.policy.optimizer.param_groups[0]["lr"]  # it may adapt

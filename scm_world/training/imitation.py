@@ -20,13 +20,13 @@ from scm_world._arguments import load, one_of, whole_number
 from scm_world._fingerprint import fingerprint
 from scm_world._types import Floats, Observation
 from scm_world.env import ScmWorldEnv
-from scm_world.env.observer import FAILED, context_of
+from scm_world.env.observer import FAILED
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation.episodes import Hook, in_world, play, under
 from scm_world.evaluation.protocols import chosen, protocols_of
 from scm_world.evaluation.recording import Recording, action_noise
 from scm_world.policies import MlpPolicy, as_agent, save_policy
-from scm_world.policies.cards import OPTIONS
+from scm_world.policies.cards import OPTIONS, context_of
 from scm_world.policies.networks import policy_in
 from scm_world.policies.scripted import NAMED, Policy
 from scm_world.policies.zoo import PREFIX as ZOO

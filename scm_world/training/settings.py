@@ -11,9 +11,9 @@ from typing import Annotated, Any, Literal, Self, TypeVar, final
 from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
 
 from scm_world._arguments import load, one_of, plain
-from scm_world.env.observer import EVERY, context_of
 from scm_world.errors import ScmWorldError, UnknownOption
 from scm_world.evaluation.episodes import METRICS
+from scm_world.policies.cards import EVERY, context_of
 from scm_world.tasks import TASKS, Task, tasks
 from scm_world.tasks.sources import FILES, is_named
 from scm_world.variables.spaces import Frozen

@@ -141,8 +141,13 @@ def test_a_context_can_be_some_parameters(history: int) -> None:
     assert len(one.reset(seed=0)[0]) == len(bare) + 1 + history
     for same in (["floor_friction"], {"observation": "floor_friction"}):  # for policy files, too
         other = make(context=same, **both).unwrapped
-        assert other.made_with == one.unwrapped.made_with
         PolicyAbout.in_env(one).check(other, "it")
+        PolicyAbout(task="pushing", env={"context": same, "history": history,
+                    "normalize_observations": False}).check(one.unwrapped, "it")  # fmt: skip
+    for same in ("*", ["*"], {"observation": "*"}):
+        PolicyAbout.in_env(make(context="observation")).check(make(context=same).unwrapped, "it")
+    with pytest.raises(UnknownOption, match="context for 'it'"):
+        PolicyAbout.in_env(one).check(make(**both).unwrapped, "it")
 
 
 @pytest.mark.parametrize(

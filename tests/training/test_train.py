@@ -428,6 +428,18 @@ def test_trackers_and_a_callback_get_the_numbers(
         run("ppo", tmp_path / "no", log="trackio")
 
 
+def test_an_agent_that_is_told_some_causes_is_scored_on_the_way(tmp_path: Path) -> None:
+    """Its file is that of its environment, in each form of the option."""
+    told: dict[str, Any] = {"observations": "privileged", "env": {"context": ["*.mass"]}}
+    made = recipe("pushing", **{**SMALL, **told}, steps=64, n_steps=8, batch_size=16)
+    found = run(made, tmp_path)
+    given = {"context": "*.mass", "max_episode_length": 3}
+    agent = as_agent(found.policy, env={"context": {"observation": "*.mass"}})
+    scores = evaluate({"told": agent}, "P0", task="pushing", backend="fake", n=1, env=given)
+    assert found.score is not None
+    assert len(scores.frame) == 1
+
+
 def test_levels_are_a_fixed_set_of_episodes(tmp_path: Path) -> None:
     """All worlds play them; trials have the scores on them and on new draws, and the gap."""
     made = RECIPES["ppo"].but(levels=3, curriculum="P5", steps=128)
