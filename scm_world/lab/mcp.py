@@ -164,6 +164,9 @@ class _Guarded:
             code, why = 401, "this server needs its token: Authorization: Bearer …"
         elif not fits:
             code, why = 413, f"at most {LARGEST} bytes, of a stated length"
+            if length.isdigit() and int(length) <= 2 * LARGEST:  # else the sender may not hear it
+                while (await receive()).get("more_body"):
+                    pass
         else:
             await self._manager.handle_request(scope, receive, send)
             return

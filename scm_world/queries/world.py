@@ -351,6 +351,7 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         >>> pole.reset(seed=0)
         >>> print(pole.do({"pole.mass": 2.5}))
         pole.mass = 2.5, engine reports 2.5
+          note: pole.inertia as before, not in proportion to the mass
         >>> from scm_world.variables import Box, Derived, Exogenous, Linear, Measured, Normal
         >>> growth = World(
         ...     lambda parameters, state, action, noise: {
