@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from functools import partial
 from types import MappingProxyType
 from typing import Any, Literal, Protocol, Self, cast, final
 
@@ -62,10 +61,8 @@ USUAL: Mapping[str, JsonValue] = {**FORM, **COMMON, **FREE}
 OPTIONS = tuple(USUAL)
 
 
-as_json = partial(to_jsonable_python, fallback=plain)
-"""Return options as JSON has them."""
-
 CONTEXTS = ("none", "observation", "privileged")
+"""Where an environment has the values of parameters: nowhere, in the observation, beside it."""
 
 EVERY = ("*",)
 """The pattern of all parameters."""
@@ -97,7 +94,7 @@ def option_form(name: str, given: object) -> JsonValue:
         with suppress(UnknownOption):
             mode, names = context_of(given)
             return mode if names == EVERY else {mode: [*names]}
-    return cast("JsonValue", as_json(given))
+    return cast("JsonValue", to_jsonable_python(given, fallback=plain))
 
 
 class PolicyEnv(Protocol):

@@ -239,11 +239,10 @@ def report(
     followed = {name: (np.array(old[name]), np.array(now[name])) for name in names}
     engine = {".".join(key): (was, reported[key]) for key, was in inertia.items()}
     there, were = ({*one.composition.bodies} for one in (compiled, old.compiled))
-    parameters = compiled.parameter_keys.keys() & old.compiled.parameter_keys
-    inertias = {n: n.removesuffix("mass") + "inertia" for n in asked if n.endswith(".mass")}
-    still = [name for name, other in inertias.items() if {name, other} <= parameters]
-    still = [n for n in still if not same(old[n], now[n]) and inertias[n] not in asked]
-    if kept := [inertias[n] for n in still if same(old[inertias[n]], now[inertias[n]])]:
+    parameters = {*compiled.parameter_keys} & {*old.compiled.parameter_keys}
+    pairs = ((n, n.removesuffix("mass") + "inertia") for n in asked if n.endswith(".mass"))
+    pairs = (pair for pair in pairs if parameters.issuperset(pair) and pair[1] not in asked)
+    if kept := [i for n, i in pairs if not same(old[n], now[n]) and same(old[i], now[i])]:
         remarks += (f"{some(kept)} as before, not in proportion to the mass",)
     if done.change is not None:
         remarks += (*_pulled(before, done),)

@@ -543,7 +543,7 @@ class CompiledTask(Vectors):
 
 
 def _after_commands(variables: list[Variable]) -> Iterator[Variable]:
-    """Replace commands by those of the control step before, with lag 1, in what they compute.
+    """Yield variables; what a command computes has that of the control step before, with lag 1.
 
     An instant is computed when its command has not been chosen.
     """

@@ -26,7 +26,7 @@ from scm_world.errors import (
 from scm_world.evaluation import in_world
 from scm_world.policies import MlpPolicy, PolicyAbout, load_policy, save_policy
 from scm_world.policies.agents import agent_from, as_agent
-from scm_world.policies.cards import KEY, OPTIONS, USUAL, as_json
+from scm_world.policies.cards import KEY, OPTIONS, USUAL, option_form
 from scm_world.queries import World
 
 SEEN = np.random.default_rng(1).uniform(-1, 1, (5, 4, 56)).astype(np.float32)
@@ -316,7 +316,7 @@ def test_files_are_written_whole_or_not_at_all(
 def test_options_of_the_environment_exist() -> None:
     """The format knows the options of the environment by their names, and what is usual."""
     of_env = inspect.signature(ScmWorldEnv).parameters
-    assert {name: as_json(of_env[name].default) for name in OPTIONS} == USUAL
+    assert {name: option_form(name, of_env[name].default) for name in OPTIONS} == USUAL
     about = PolicyAbout(task="pushing", env={"include": ("joint_torques",), "frame_skip": 10})
     assert about.option("include") == ["joint_torques"]
     assert about.option("context") == "none"

@@ -148,7 +148,7 @@ EFFORTS = 2
 
 
 def strain(options: mujoco.MjOption, effort: int) -> None:
-    """Continue with a solver: 1 until it meets the tolerance, 2 until hardly anything improves."""
+    """Raise the effort of a solver: 1 meets its tolerance, 2 ends when hardly anything improves."""
     if effort > 0:
         options.iterations = max(options.iterations, 10 * MANY)
         options.ls_iterations = max(options.ls_iterations, MANY_LS)

@@ -142,7 +142,7 @@ class Group:
     # --- parameters ----------------------------------------------------------------------------
 
     def adopt(self, slots: Integers, constants: Constants) -> None:
-        """Set the constants of some scenes to the same ones."""
+        """Set the constants of some scenes."""
         for name in constants.rows.keys() - self._fields.keys():
             usual = self.derive.defaults[name][None]
             self._fields[name] = np.repeat(usual, len(self.rows), axis=0)
